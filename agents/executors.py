@@ -1,21 +1,25 @@
-"""Executors of tasks: in this process, in processes of this machine, or on a Ray cluster.
+"""Executors of tasks: this process, processes of this machine, or a Ray cluster.
 
-All three are `concurrent.futures.Executor`, and results do not depend on which one it is. Their
-``ahead`` is the number of tasks to submit ahead of results, so that no worker waits for one.
+All are `concurrent.futures.Executor`, and results do not depend on which one it is. A task whose
+worker dies is run again. ``ahead`` is the number of tasks to submit ahead of results, so that no
+worker waits for one.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
-import platform
-import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Generator, Iterable, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from collections.abc import Callable, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from functools import partial
 from itertools import islice
 from typing import Any, Literal, TypeVar
@@ -36,11 +40,8 @@ ExecutorName = Literal["local", "ray"]
 RETRIES = 3
 """Further attempts at a task whose worker or node dies. An error of the task itself is final."""
 
-CONNECT_SECONDS = 10.0
-"""Longest time for a connection to a cluster [s]."""
-
-HEALTH_SECONDS = 12.0
-"""Longest time for a cluster to say that it works [s]."""
+ANSWER_SECONDS = 20.0
+"""Longest time for a cluster to say that it works [s]; `ray.init` would try for minutes."""
 
 
 class ExecutorError(RuntimeError):
@@ -62,70 +63,50 @@ class ThisProcess(Executor):
         return future
 
 
-class LocalProcesses(Executor):
+class LocalProcesses(ThreadPoolExecutor):
     """Runs tasks in processes of this machine, of one thread each.
 
-    They leave Ctrl-C to this process, and end with it however it ends. When one dies, all tasks
-    that are not done are run again by new ones, each up to `RETRIES` times.
+    They leave Ctrl-C to this process, and end with it however it ends. A thread waits for each
+    task, and runs it again, up to `RETRIES` times, where one of the processes dies.
 
     Args:
-        workers: Number of processes.
+        workers: Number of processes, which start with the first call.
 
     Raises:
         ValueError: ``workers`` is below 1.
     """
 
     def __init__(self, workers: int) -> None:
-        """Check the number; processes start with the first call."""
+        """Check the number."""
         self.workers = integer("workers", workers, 1)
         self.ahead = 2 * workers
         self._is_cancelled = False
+        super().__init__(self.ahead)
 
     def submit(self, fn: Callable[..., ResultT], /, *args: Any, **kwargs: Any) -> Future[ResultT]:
         """Run a call in one of the processes."""
-        self._is_cancelled = False
-        outcome: Future[ResultT] = Future()
-        self._begin(outcome, partial(fn, *args, **kwargs), RETRIES)
-        return outcome
+        return super().submit(self._run, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes; with ``cancel_futures`` without waiting for what they run."""
         self._is_cancelled = cancel_futures
-        self._pool().shutdown(wait=wait, kill_workers=cancel_futures)
+        # What waits must not begin once processes are gone, and what runs needs them to its end.
+        super().shutdown(wait and not cancel_futures, cancel_futures=cancel_futures)
+        self._processes().shutdown(wait=wait, kill_workers=cancel_futures)
 
-    def _begin(self, outcome: Future[ResultT], call: Callable[[], ResultT], retries: int) -> None:
-        try:
-            inner = self._pool().submit(call)
-        except BrokenExecutor as problem:
-            self._end(outcome, call, retries, problem)
-            return
-
-        def end(inner: Future[ResultT]) -> None:
-            problem = inner.exception()
-            if problem is None:
-                outcome.set_result(inner.result())
+    def _run(self, call: Callable[[], ResultT]) -> ResultT:
+        for _ in range(RETRIES + 1):
+            try:
+                result: ResultT = self._processes().submit(call).result()
+            except BrokenExecutor as problem:
+                if self._is_cancelled:
+                    raise
+                lost = problem
             else:
-                self._end(outcome, call, retries, problem)
+                return result
+        raise ExecutorError(_lost(type(lost).__name__)) from lost
 
-        inner.add_done_callback(end)
-
-    def _end(
-        self,
-        outcome: Future[ResultT],
-        call: Callable[[], ResultT],
-        retries: int,
-        problem: BaseException,
-    ) -> None:
-        if not isinstance(problem, BrokenExecutor) or self._is_cancelled:
-            outcome.set_exception(problem)
-        elif retries == 0:
-            outcome.set_exception(ExecutorError(_lost(type(problem).__name__)))
-        else:
-            # In a thread of its own: this one may belong to the processes that are replaced.
-            again = outcome, call, retries - 1
-            threading.Thread(target=self._begin, args=again, daemon=True).start()
-
-    def _pool(self) -> Any:
+    def _processes(self) -> Any:
         """Return the processes, new ones where one has died."""
         return loky.get_reusable_executor(
             self.workers,
@@ -160,7 +141,7 @@ class RayCluster(Executor):
         if not ray.is_initialized():
             self._connect(address or os.environ.get("RAY_ADDRESS"))
         # Spread, so that all nodes have tasks from the first on.
-        self._call: Any = ray.remote(_call).options(
+        self._call: Any = ray.remote(lambda fn, *args, **kwargs: fn(*args, **kwargs)).options(
             max_retries=RETRIES, scheduling_strategy="SPREAD"
         )
         self._running: dict[Future[Any], Any] = {}
@@ -172,8 +153,7 @@ class RayCluster(Executor):
 
     def submit(self, fn: Callable[..., ResultT], /, *args: Any, **kwargs: Any) -> Future[ResultT]:
         """Run a call on a node."""
-        reference = self._call.remote(fn, args, kwargs)
-        outcome: Future[ResultT] = Future()
+        reference, outcome = self._call.remote(fn, *args, **kwargs), Future[ResultT]()
         self._running[outcome] = reference
 
         def end(inner: Future[ResultT]) -> None:
@@ -195,7 +175,7 @@ class RayCluster(Executor):
 
     def _connect(self, address: str | None) -> None:
         if address is not None and address != "auto":
-            _reach(address)
+            _require_cluster(address)
         environment: dict[str, Any] = {"env_vars": {"OMP_NUM_THREADS": "1"}}
         if TOOLS.is_dir():
             environment["worker_process_setup_hook"] = "dptse_env.command_line.add_tools_path"
@@ -205,14 +185,11 @@ class RayCluster(Executor):
                 runtime_env=environment,
                 log_to_driver=False,
                 include_dashboard=False if address is None else None,
-                logging_level=logging.WARNING,
+                logging_level="WARNING",
             )
         except (ConnectionError, RuntimeError, ValueError, self._ray.exceptions.RayError) as error:
             there = "on this machine" if address in (None, "auto") else f"at {address}"
-            raise ExecutorError(
-                f"no cluster {there} takes this program (Python {platform.python_version()}, Ray "
-                f"{self._ray.__version__}): {error}"
-            ) from error
+            raise ExecutorError(f"no cluster {there} takes this program: {error}") from error
 
     def _explained(self, problem: BaseException) -> BaseException:
         """Return the error of a task itself, or else one that says how its worker was lost."""
@@ -231,10 +208,6 @@ AnyExecutor = ThisProcess | LocalProcesses | RayCluster
 THIS_PROCESS = ThisProcess()
 
 
-def _call(fn: Callable[..., ResultT], args: Sequence[Any], kwargs: dict[str, Any]) -> ResultT:
-    return fn(*args, **kwargs)
-
-
 def _lost(reason: str) -> str:
     return (
         f"a task was lost {RETRIES + 1} times ({reason}): results so far are kept, the same "
@@ -242,38 +215,22 @@ def _lost(reason: str) -> str:
     )
 
 
-def _reach(address: str) -> None:
-    """Check that a cluster answers at an address; `ray.init` would try for minutes.
+def _require_cluster(address: str) -> None:
+    """Check that a Ray cluster answers at an address.
 
     Raises:
-        ExecutorError: None does, or the address is no host:port.
+        ExecutorError: None does.
     """
-    host, colon, port = address.rpartition(":")
-    if not (host and colon and port.isdecimal()) or "://" in address:
-        raise ExecutorError(
-            f"address must be host:port of a cluster's head node, or auto, got {address!r}. Run "
-            "the program on a node of the cluster"
-        )
-    try:
-        socket.create_connection((host, int(port)), CONNECT_SECONDS).close()
-    except OSError as problem:
-        raise ExecutorError(
-            f"no cluster answers at {address} ({problem}): start one there with 'ray start "
-            "--head', or give --address another one"
-        ) from problem
     command = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", address]
-    try:
-        answer = subprocess.run(
-            command, capture_output=True, text=True, check=False, timeout=HEALTH_SECONDS
-        )
-    except subprocess.TimeoutExpired as problem:
+    answers = False
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        asked = subprocess.run(command, capture_output=True, check=False, timeout=ANSWER_SECONDS)
+        answers = asked.returncode == 0
+    if not answers:
         raise ExecutorError(
-            f"what listens at {address} does not answer as a Ray cluster: give --address that of a "
-            "head node, as 'ray start --head' prints it"
-        ) from problem
-    if answer.returncode:
-        lines = answer.stderr.strip().splitlines() or ["it is not healthy"]
-        raise ExecutorError(f"the cluster at {address} cannot be used: {lines[-1]}")
+            f"no Ray cluster answers at {address}: give --address host:port of a head node, as "
+            "'ray start --head' prints it there"
+        )
 
 
 def make_executor(name: ExecutorName, workers: int, address: str | None = None) -> AnyExecutor:
@@ -297,36 +254,6 @@ def make_executor(name: ExecutorName, workers: int, address: str | None = None) 
     return ThisProcess() if integer("workers", workers, 1) == 1 else LocalProcesses(workers)
 
 
-def run_tasks(
-    executor: AnyExecutor, work: Callable[[TaskT], ResultT], tasks: Iterable[TaskT]
-) -> Generator[tuple[TaskT, ResultT], None, None]:
-    """Yield tasks with their results, in whatever order they end.
-
-    Tasks are taken one by one as workers come free, and nothing is kept of one that is yielded:
-    memory does not grow with their number. Closing the generator ends what still runs.
-
-    Args:
-        executor: One of this module.
-        work: Runs a task; a function that workers can import.
-        tasks: The tasks; they can be pickled.
-
-    Raises:
-        ExecutorError: Workers died again and again. Errors of ``work`` are raised as they are.
-    """
-    waiting, running = iter(tasks), dict[Future[ResultT], TaskT]()
-    try:
-        while True:
-            for task in islice(waiting, max(executor.ahead - len(running), 0)):
-                running[executor.submit(work, task)] = task
-            if not running:
-                return
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                yield running.pop(future), future.result()
-    except BaseException:
-        executor.shutdown(cancel_futures=True)
-        raise
-
-
 def run_shown(
     executor: AnyExecutor,
     work: Callable[[TaskT], ResultT],
@@ -337,23 +264,38 @@ def run_shown(
     progress: bool = True,
     **bar: Any,
 ) -> None:
-    """Run tasks as `run_tasks` does, with a progress bar, and hand over each result as it comes.
+    """Run tasks with a progress bar, and hand over each result as it comes, in whatever order.
+
+    Nothing is kept of a task that is done. What still runs is ended where anything goes wrong, and
+    on Ctrl-C.
 
     Args:
         executor: Runs the tasks.
-        work: Runs one.
-        tasks: The tasks.
+        work: Runs one; a function that workers can import.
+        tasks: The tasks; they can be pickled.
         take: Called with each task and its result.
         size: Units of the bar that a task stands for.
         progress: Whether to show the bar.
         bar: Further options of `tqdm`.
+
+    Raises:
+        ExecutorError: Workers died again and again. Errors of ``work`` are raised as they are.
     """
-    shown = tqdm(total=sum(map(size, tasks)), disable=not progress, **bar)
-    # Closed at once: an interrupt between two results must end the workers, too.
-    with shown, contextlib.closing(run_tasks(executor, work, tasks)) as finished:
-        for task, result in finished:
-            take(task, result)
-            shown.update(size(task))
+    waiting, running = iter(tasks), dict[Future[ResultT], TaskT]()
+    with tqdm(total=sum(map(size, tasks)), disable=not progress, **bar) as shown:
+        try:
+            while True:
+                for task in islice(waiting, max(executor.ahead - len(running), 0)):
+                    running[executor.submit(work, task)] = task
+                if not running:
+                    return
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    task = running.pop(future)
+                    take(task, future.result())
+                    shown.update(size(task))
+        except BaseException:
+            executor.shutdown(cancel_futures=True)
+            raise
 
 
 def run_in_order(

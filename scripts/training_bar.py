@@ -41,15 +41,13 @@ class Bar:
 
 
 @contextlib.contextmanager
-def watched(
-    bar: Bar, output: Path, tensorboard: bool = True
-) -> Iterator[tuple[Callable[[Row], None], ...]]:
-    """Yield the watchers of a training: a bar and, where it is wanted and installed, TensorBoard.
+def watched(bar: Bar, output: Path) -> Iterator[tuple[Callable[[Row], None], ...]]:
+    """Yield the watchers of a training: a bar and, where it is installed, TensorBoard.
 
     All rows come again when a training goes on, so those that TensorBoard has count no more.
     """
     with bar.bar:
-        if not tensorboard or importlib.util.find_spec("tensorboard") is None:
+        if importlib.util.find_spec("tensorboard") is None:
             yield (bar,)
             return
         from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  not always there

@@ -1,1 +1,9 @@
-"""Audit of a privacy claim: two adjacent worlds, an adversary, and a statistical test."""
+"""Audit of a privacy claim: two adjacent worlds, an adversary, and a statistical test.
+
+A release model of one's own is audited as any other, where it adds its noise by a
+`dptse_env.release.noise.Noise`:
+
+    config = make_config("dptse_env:dptse/ShortHighway-v0", {"privacy": {"preset": MyRelease}})
+    record = RecordLibrary().get(config.corridor, 0)
+    audit_environment(config, record, n_runs=5000).print()
+"""

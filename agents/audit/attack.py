@@ -3,24 +3,48 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
-from agents.audit.releases import AttackedRelease, Overheard, Terms, attacked
-from agents.audit.strategies import FixedQueries
-from agents.audit.worlds import AdjacentWorlds, Trajectory, audited
+from agents.audit.worlds import AdjacentWorlds, audited
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
 from dptse_env.config import EnvConfig
-from dptse_env.estimators import Measurement
+from dptse_env.estimators import Estimate, Measurement
 from dptse_env.parts import make_parts, make_release, make_traffic
 from dptse_env.process import QueryProcess
-from dptse_env.release import Request
-from dptse_env.traffic import Record
-from dptse_env.utils.arrays import BoolArray, FloatArray
+from dptse_env.release import GaussianRelease, ReleaseModel, Request
+from dptse_env.release.noise import Noise
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.fields import require
 
 BATCH = 250
 """Default number of runs per world that are played at once."""
+
+DECISION_THRESHOLD = 3.0
+"""Log-likelihood ratio at which an adaptive policy is decided: odds of 20 to 1."""
+
+
+@dataclass(frozen=True)
+class Queries:
+    """The adversary's query policy.
+
+    Attributes:
+        plan: Segments by step, shape (horizon, n_mainline).
+        is_adaptive: Whether it stops where it is decided between the worlds.
+    """
+
+    plan: BoolArray
+    is_adaptive: bool = False
+
+    def at(self, step: int, score: FloatArray) -> BoolArray:
+        """Return the segments to query, shape (k, n_mainline), given the scores so far, (k,)."""
+        undecided = (np.abs(score) < DECISION_THRESHOLD) | (not self.is_adaptive)
+        queries: BoolArray = self.plan[step] & undecided[:, None]
+        return queries
 
 
 @dataclass(frozen=True)
@@ -37,67 +61,121 @@ class Runs:
     distances: FloatArray
 
 
-class Adversary:
-    """Knows both worlds and all that is public, and works out the sums of either world.
+class _Noiseless(Noise):
+    """Adds nothing, and rounds nothing."""
+
+    def __init__(self) -> None:
+        super().__init__(0, 0)
+
+    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+        pass
+
+    def added(
+        self, episodes: IntArray, values: FloatArray, sigma: FloatArray, unit: FloatArray
+    ) -> FloatArray:
+        return values / unit[:, None]
+
+
+class Overheard(ReleaseModel):
+    """A release model and an adversary who hears all that it releases.
+
+    He knows both worlds and all that is public. To each second he finds out what either world
+    would have released without noise: by the same release model, given the run's own queries and
+    predictions. What was released he scores by the likelihood ratio of Gaussians of either mean.
 
     Attributes:
+        model: The release model.
+        last: Its last release.
         score: Log-likelihood ratio of world 1 of each run's transcript so far, shape (k,).
         square: Squared distance between the worlds' sums so far, in units of the noise, (k,).
     """
 
-    def __init__(self, config: EnvConfig, worlds: AdjacentWorlds, n_runs: int) -> None:
-        """Prepare for n_runs at once."""
+    last: Measurement
+
+    def __init__(self, config: EnvConfig, worlds: AdjacentWorlds, n: int, factor: float) -> None:
+        """Prepare for n runs, whose noise is multiplied by a factor.
+
+        Raises:
+            ValueError: The adversary does not know the distribution of the noise.
+        """
         traffic = make_traffic(config, worlds)
         traffic.load([0, 1])
-        # Sums of both worlds for every run, whichever world it is in.
-        self._attacked = attacked(make_release(config, 2 * n_runs, traffic))
+        self.model = make_release(config, n, traffic)
+        super().__init__(self.model.task, traffic)
+        # Every run in both worlds, whichever it is in.
+        self._either = make_release(config, 2 * n, traffic)
+        self._factor = factor
+        if factor != 1.0:
+            _set_noise(self.model, Noise(n, self.task.n_columns, scale=factor))
+        _set_noise(self._either, _Noiseless())
+        self.score, self.square = np.zeros(n), np.zeros(n)
 
-    def reset(self, n_runs: int) -> None:
-        """Begin new runs."""
-        self._episodes, self._worlds = np.arange(2 * n_runs), np.repeat([0, 1], n_runs)
-        nothing = np.random.default_rng(0)
-        self._attacked.model.reset(self._episodes, [nothing] * len(self._episodes))
-        self.score, self.square = np.zeros(n_runs), np.zeros(n_runs)
+    @property
+    def sigma(self) -> FloatArray:
+        """See `ReleaseModel.sigma`."""
+        return self.model.sigma
 
-    def expect(self, time: int, observed: BoolArray, terms: Terms) -> tuple[FloatArray, FloatArray]:
-        """Return midpoint and difference of both worlds' sums, (k, C, 2), and add up.
+    def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+        """See `ReleaseModel.reset`."""
+        self.model.reset(episodes, generators)
+        self._either.reset(self._in_both(episodes), [*generators, *generators])
+        self.score[episodes] = self.square[episodes] = 0.0
 
-        Both are in units of the noise; the difference is zero where nothing is observed.
-        """
-        times = np.full(len(self._episodes), time)
-        request = Request(self._episodes, self._worlds, times, np.tile(observed, (2, 1)))
-        both = terms.repeated(2)
-        zero, first = np.split(self._attacked.sums(request, both) / both.sigma, 2)
-        difference = np.where(observed[:, :, None], first - zero, 0.0)
-        self.square += np.sum(difference**2, axis=(1, 2))
-        return 0.5 * (zero + first), difference
+    def release(self, request: Request) -> Measurement:
+        """See `ReleaseModel.release`."""
+        # Asked once: a prediction holds for its second alone.
+        request = request._replace(prediction=cache(request.prediction))
+        self.last = self.model.release(request)
+        sigma = self._factor * self.last.sigma
+        zero, one = (mean / sigma for mean in self._means(request))
+        difference = np.where(self.last.observed[:, :, None], one - zero, 0.0)
+        heard = (self.last.values / sigma - 0.5 * (zero + one)) * difference
+        self.score[request.episodes] += np.sum(heard, axis=(1, 2))
+        self.square[request.episodes] += np.sum(difference**2, axis=(1, 2))
+        return self.last
 
-    def update(self, time: int, released: Measurement, terms: Terms) -> None:
-        """Score one released step: the log-likelihood ratio of Gaussians of either mean."""
-        midpoint, difference = self.expect(time, released.observed, terms)
-        self.score += np.sum((released.values / terms.sigma - midpoint) * difference, axis=(1, 2))
+    def _means(self, request: Request) -> tuple[FloatArray, FloatArray]:
+        """Return what either world would release without noise, shape (k, C, 2) each."""
+
+        def predicted_twice() -> Estimate:
+            return Estimate(*(np.concatenate([each, each]) for each in request.prediction()))
+
+        k = len(request.episodes)
+        both = Request(
+            self._in_both(request.episodes),
+            np.repeat([0, 1], k),
+            np.tile(request.times, 2),
+            np.tile(request.observed, (2, 1)),
+            predicted_twice,
+        )
+        values = self._either.release(both).values
+        return values[:k], values[k:]
+
+    def _in_both(self, episodes: IntArray) -> IntArray:
+        return np.concatenate([episodes, episodes + len(self.score)])
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Some runs in both worlds, with everything that a worker needs to play them.
+def _set_noise(release: Any, noise: Noise) -> None:
+    if not isinstance(getattr(release, "noise", None), Noise):
+        raise ValueError(
+            "the audit needs a release model with Gaussian noise, a dptse_env.release.noise.Noise "
+            f"as its attribute noise, got {release.task.name!r}"
+        )
+    release.noise = noise
 
-    Attributes:
-        runs: Numbers of the runs, which seed their noise.
-    """
 
-    config: EnvConfig
-    worlds: AdjacentWorlds
-    policy: FixedQueries
-    runs: range
-    noise_factor: float
-    seed: int
+def make_overheard(
+    config: EnvConfig, worlds: AdjacentWorlds, n: int, factor: float = 1.0
+) -> tuple[QueryProcess, Overheard]:
+    """Return a process of n episodes in either world, and its release model, overheard."""
+    release = Overheard(config, worlds, n, factor)
+    return QueryProcess(make_parts(config, n, traffic=release.traffic, release=release)), release
 
 
 def attack(
     config: EnvConfig,
     worlds: AdjacentWorlds,
-    policy: FixedQueries,
+    queries: Queries,
     n_runs: int,
     *,
     noise_factor: float = 1.0,
@@ -108,31 +186,28 @@ def attack(
 ) -> Runs:
     """Play both worlds and score every transcript.
 
-    Each run is an episode of the decision process from the first second of the record. Where prices
-    follow estimates, the estimator is that of the configuration. Elsewhere estimates reveal nothing
-    beyond the releases, and the cheapest estimator is used.
+    Each run is an episode of the decision process from the first second of the record.
 
     Args:
         config: The configuration under attack.
         worlds: The two worlds.
-        policy: Chooses the queries.
+        queries: The query policy.
         n_runs: Runs per world n.
         noise_factor: Multiplies the noise that the configuration declares.
         seed: Seeds the noise, >= 0.
         batch: Runs per world that are played at once; results do not depend on it.
         executor: Plays the batches.
         progress: Whether to show a progress bar.
+
+    Raises:
+        ValueError: The adversary does not know the distribution of the noise.
     """
     config = audited(attacked_form(config), worlds)
-    batches = [
-        Batch(config, worlds, policy, range(n_runs)[first : first + batch], noise_factor, seed)
-        for first in range(0, n_runs, batch)
-    ]
     played = run_in_order(
         executor,
-        play,
-        batches,
-        size=lambda each: 2 * len(each.runs),
+        partial(play, config, worlds, queries, noise_factor, seed),
+        [range(n_runs)[first : first + batch] for first in range(0, n_runs, batch)],
+        size=lambda runs: 2 * len(runs),
         progress=progress,
         desc="attacking",
         unit="run",
@@ -143,59 +218,42 @@ def attack(
     )
 
 
-def play(batch: Batch) -> Runs:
-    """Play a batch of runs in both worlds."""
-    config, n = batch.config, 2 * len(batch.runs)
-    process, release, played = _make_process(config, batch.worlds, n)
-    played.scale_noise(batch.noise_factor)
-    adversary = Adversary(config, batch.worlds, n)
+def play(
+    config: EnvConfig,
+    worlds: AdjacentWorlds,
+    queries: Queries,
+    noise_factor: float,
+    seed: int,
+    runs: range,
+) -> Runs:
+    """Play some runs in both worlds; their numbers seed their noise."""
+    n = len(runs)
+    process, release = make_overheard(config, worlds, 2 * n, noise_factor)
     for world in (0, 1):
         # A run's noise stream does not depend on the batch.
-        streams = [np.random.default_rng((batch.seed, world, run)) for run in batch.runs]
-        options = {"traffic_seed": world, "start": 0}
-        process.reset(world * len(streams) + np.arange(len(streams)), streams, options)
-    adversary.reset(n)
+        streams = [np.random.default_rng((seed, world, run)) for run in runs]
+        process.reset(world * n + np.arange(n), streams, {"traffic_seed": world, "start": 0})
     for step in range(config.horizon_steps):
-        queries = batch.policy.queries(step, adversary.score)
-        process.step(np.arange(n), queries.astype(np.int8))
-        adversary.update(step + 1, release.last, played.terms(release.last))
-    return Runs(adversary.score.reshape(2, -1), np.sqrt(adversary.square).reshape(2, -1))
-
-
-def _make_process(
-    config: EnvConfig, worlds: AdjacentWorlds, n: int
-) -> tuple[QueryProcess, Overheard, AttackedRelease]:
-    """Return a process of n episodes in either world, and its release model, overheard."""
-    traffic = make_traffic(config, worlds)
-    release = Overheard(make_release(config, n, traffic))
-    process = QueryProcess(make_parts(config, n, traffic=traffic, release=release))
-    return process, release, attacked(release.model)
-
-
-def public_terms(config: EnvConfig, record: Record, plan: BoolArray, seed: int = 0) -> Terms:
-    """Play an episode over a record, and return the terms of its releases, with T rows.
-
-    Args:
-        config: The configuration.
-        record: The traffic.
-        plan: Queries, shape (T, n_mainline).
-        seed: Seeds noise and estimator.
-    """
-    alike = AdjacentWorlds(record, (Trajectory.absent(), Trajectory.absent()))
-    process, release, played = _make_process(attacked_form(config), alike, 1)
-    one, terms = np.arange(1), []
-    process.reset(one, [np.random.default_rng(seed)], {"traffic_seed": 0, "start": 0})
-    for queried in plan:
-        process.step(one, queried[None].astype(np.int8))
-        terms.append(played.terms(release.last))
-    return Terms(*(np.concatenate(rows) for rows in zip(*terms, strict=True)))
+        queried = queries.at(step, release.score)
+        process.step(np.arange(2 * n), queried.astype(np.int8))
+    return Runs(release.score.reshape(2, n), np.sqrt(release.square).reshape(2, n))
 
 
 def attacked_form(config: EnvConfig) -> EnvConfig:
-    """Return a configuration with the episodes and the estimator of the attack."""
+    """Return a configuration with the episodes and the estimator of the attack.
+
+    Where noise is constant, estimates reveal nothing beyond the releases, and the cheapest
+    estimator is used. Elsewhere prices and centres follow them, so that it is the configuration's.
+
+    Raises:
+        ValueError: A query may cover several segments.
+    """
+    options = make_release(config).task.queries.n_options
+    n = config.corridor.n_mainline
+    require(options == n, "query_spans", "(1,), at one price, for an audit", config.query_spans)
     config = dataclasses.replace(
         config, traffic_seeds=(0, 1), random_start=False, action="mask", backend="compiled"
     )
-    if attacked(make_release(config)).follows_estimates:
-        return config
-    return dataclasses.replace(config, estimator="open_loop", estimator_settings=None)
+    if isinstance(make_release(config), GaussianRelease):
+        return dataclasses.replace(config, estimator="open_loop", estimator_settings=None)
+    return config

@@ -1,20 +1,33 @@
-"""The finding of an audit, as a table and as a file."""
+"""An audit from the record to its finding, which is a table and a file."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from agents.audit.statistics import AuditResult, detectable_mu, rejection_probability
+from agents.audit.attack import attack
+from agents.audit.planner import Planner
+from agents.audit.statistics import (
+    AuditResult,
+    Claim,
+    audit,
+    detectable_mu,
+    rejection_probability,
+)
+from agents.executors import THIS_PROCESS, AnyExecutor
 from agents.files import write_json
 from agents.terminal import make_table, print_table, print_text
-from dptse_env.privacy import epsilon_of
+from dptse_env.config import EnvConfig
+from dptse_env.parts import privacy_report
+from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import PrivacyReport
+from dptse_env.traffic import Record
 
 VIOLATION = math.sqrt(2.0)
 """Ratio of a true mu to the claimed one for which power is reported: noise divided by 1.41."""
@@ -105,3 +118,61 @@ class Finding:
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, content)
+
+
+def audit_environment(
+    config: EnvConfig,
+    record: Record,
+    target: str = "worst-case",
+    policy: str = "hunter",
+    *,
+    n_runs: int = 5000,
+    noise_factor: float = 1.0,
+    confidence: float = 0.95,
+    seed: int = 0,
+    executor: AnyExecutor = THIS_PROCESS,
+) -> Finding:
+    """Choose two worlds, play both, and test the claim to users.
+
+    Args:
+        config: The configuration under attack, of `agents.environments.make_config`.
+        record: The traffic, whose vehicles are known.
+        target: Kind of the vehicle that differs, in `agents.audit.planner.KINDS`.
+        policy: Queries, in `agents.audit.planner.POLICIES`.
+        n_runs: Runs in each of the two worlds, >= 2.
+        noise_factor: Multiplies the real noise, not the declared one.
+        confidence: Confidence of the lower bounds.
+        seed: Seeds the noise, >= 0.
+        executor: Plays the runs.
+
+    Raises:
+        ValueError: A kind or policy is unknown or does not suit the environment, the record has too
+            few vehicles, or the release model does not add its noise by a
+            `dptse_env.release.noise.Noise`.
+    """
+    planner, report = Planner(config, policy), privacy_report(config)
+    worlds = planner.choose(record, target)
+    start = time.perf_counter()
+    runs = attack(
+        config,
+        worlds,
+        planner.queries(worlds),
+        n_runs,
+        noise_factor=noise_factor,
+        seed=seed,
+        executor=executor,
+    )
+    epsilon, delta = report.claimed_epsilon, report.claimed_delta
+    # The account of a guarantee, or else the requested parameters.
+    mu = mu_of(epsilon, delta) if report.guarantee == "none" else report.mu
+    return Finding(
+        title=f"preset {report.preset} at ({epsilon:g}, {delta:g})",
+        target=worlds.description,
+        policy=policy,
+        n_runs=n_runs,
+        noise_factor=noise_factor,
+        distance=float(runs.distances.max()),
+        result=audit(runs.scores[0], runs.scores[1], Claim(mu, epsilon, delta), confidence),
+        privacy=report,
+        seconds=time.perf_counter() - start,
+    )

@@ -105,10 +105,11 @@ class Search:
 
     @property
     def name(self) -> str:
-        """Name of the set."""
+        """Name of the set, which names its files: of a class with a dot in place of the colon."""
         config = self.config
         parameters, preset = config.arz_parameters.name, str(config.privacy.preset)
-        return settings_name(self.estimator, parameters, preset, self.variant)
+        name = settings_name(self.estimator, parameters, preset, self.variant)
+        return name.replace(":", ".")  # Windows has no files with a colon
 
     def cell(self, settings: EstimatorSettings | None = None) -> Cell:
         """Return what a trial plays; with the environment's own settings if None."""

@@ -11,41 +11,39 @@ from agents.executors import (
     ThisProcess,
     make_executor,
     run_in_order,
-    run_tasks,
+    run_shown,
 )
 from dptse_env.utils.registry import MissingExtraError
 
 
-@pytest.fixture(scope="module")
-def processes():
-    made = LocalProcesses(2)
-    yield made
-    made.shutdown()
-
-
-@pytest.mark.parametrize("kind", ["this process", "processes"])
-def test_tasks_come_back_with_their_results_and_errors_as_they_are(kind, processes):
-    executor = ThisProcess() if kind == "this process" else processes
-    assert dict(run_tasks(executor, operator.neg, range(9))) == {k: -k for k in range(9)}
-    assert list(run_tasks(executor, operator.neg, [])) == []
-    done = []
-    assert run_in_order(executor, operator.neg, [3, 1, 2], done.append, progress=False) == [
-        -3, -1, -2,
-    ]  # fmt: skip
-    assert done[-1] == 1.0
-    with pytest.raises(ZeroDivisionError):
-        list(run_tasks(executor, reciprocal, [1, 0, 2]))
+def run(executor, work, tasks):
+    return run_in_order(executor, work, tasks, progress=False)
 
 
 def reciprocal(number):
     return 1 / number
 
 
-def test_tasks_are_taken_as_workers_come_free():
-    taken = []
-    numbers = (taken.append(number) or number for number in range(20))
-    for done, _ in enumerate(run_tasks(ThisProcess(), operator.neg, numbers), start=1):
-        assert len(taken) - done <= 1
+@pytest.mark.parametrize("kind", [ThisProcess, lambda: LocalProcesses(2)])
+def test_tasks_come_back_with_their_results_and_errors_as_they_are(kind):
+    executor, done = kind(), []
+    assert run(executor, operator.neg, range(9)) == [-k for k in range(9)]
+    assert run(executor, operator.neg, []) == []
+    assert run_in_order(executor, operator.neg, [3, 1], done.append, progress=False) == [-3, -1]
+    assert done == [0.5, 1.0]
+    with pytest.raises(ZeroDivisionError):
+        run(executor, reciprocal, [1, 0, 2])
+
+
+def test_a_result_is_handed_over_before_the_next_task_begins():
+    seen = []
+
+    def work(number):
+        seen.append(("begun", number))
+        return number
+
+    run_shown(ThisProcess(), work, [1, 2], lambda task, _: seen.append(("taken", task)))
+    assert seen == [("begun", 1), ("taken", 1), ("begun", 2), ("taken", 2)]
 
 
 def dies(number):
@@ -64,16 +62,25 @@ def dies_once(task):
 
 
 @pytest.mark.slow
-def test_a_task_whose_worker_died_runs_again(processes, tmp_path):
+def test_a_task_whose_worker_died_runs_again_three_times(tmp_path):
     tasks = [(number, tmp_path / "trace") for number in range(8)]
-    assert sorted(number for _, number in run_tasks(processes, dies_once, tasks)) == list(range(8))
+    assert run(LocalProcesses(2), dies_once, tasks) == list(range(8))
+    with pytest.raises(ExecutorError, match="a task was lost 4 times"):
+        run(LocalProcesses(2), dies, range(8))
+    assert run(LocalProcesses(2), abs, [-1]) == [1]
 
 
 @pytest.mark.slow
-def test_a_task_is_given_up_when_four_workers_died(processes):
-    with pytest.raises(ExecutorError, match="a task was lost 4 times"):
-        list(run_tasks(processes, dies, range(8)))
-    assert dict(run_tasks(processes, abs, [-1])) == {-1: 1}
+def test_an_error_ends_what_still_runs():
+    start = time.monotonic()
+    with pytest.raises(ZeroDivisionError):
+        run(LocalProcesses(2), sleep_or_fail, [0.0, *[60.0] * 5])
+    assert time.monotonic() - start < 30.0
+
+
+def sleep_or_fail(seconds):
+    time.sleep(seconds)
+    return 1 / seconds
 
 
 @pytest.mark.parametrize("workers", [0, 1.5])

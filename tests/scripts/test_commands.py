@@ -39,7 +39,7 @@ def help_of(name, monkeypatch):
     return done.stdout
 
 
-LONG = ["train", "audit"]
+LONG = ["audit"]
 WITH_EXAMPLE = [name for name in COMMANDS if name not in LONG]
 
 

@@ -4,10 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from agents.audit.attack import attack
-from agents.audit.planner import choose_target, make_policy
+from agents.audit.attack import Queries, attack
+from agents.audit.planner import Planner
+from agents.audit.worlds import Trajectory
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.simple import OpenLoop
+from dptse_env.parts import privacy_report
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.traffic import SHORT_HIGHWAY, Demand
 
@@ -16,20 +18,22 @@ ROAD = dataclasses.replace(
     SHORT_HIGHWAY, duration=HORIZON, demand=Demand(((0.0, 1000.0),), (100.0,)), incident=None
 )
 N_COLUMNS = ROAD.n_segments + ROAD.n_boundaries
+SECONDS = np.arange(1, HORIZON + 1)
 
 
-def config(bandwidth=2, horizon=None, **privacy):
+def config(bandwidth=2, horizon=None, estimator="open_loop", **privacy):
+    """Contributions are capped at six if not told otherwise."""
     privacy = {"preset": "capped", **privacy}
     if privacy["preset"] == "capped":
         privacy = {"cap": 6, **privacy}
     settings = RELEASE_MODELS.find(privacy["preset"]).settings_type(**privacy)
-    return EnvConfig(ROAD, privacy=settings, bandwidth=bandwidth, horizon=horizon)
+    made = EnvConfig(ROAD, privacy=settings, bandwidth=bandwidth, horizon=horizon)
+    return dataclasses.replace(made, estimator=estimator)
 
 
-def paced(estimator="open_loop", bandwidth=2, **privacy):
+def paced(estimator="open_loop", **privacy):
     """The paced ledger at a strength at which few runs suffice."""
-    setting = config(bandwidth, **{"preset": "paced", "epsilon": 5.0, **privacy})
-    return dataclasses.replace(setting, estimator=estimator)
+    return config(estimator=estimator, **{"preset": "paced", "epsilon": 5.0, **privacy})
 
 
 class HalfTheLimit(OpenLoop):
@@ -41,13 +45,18 @@ class HalfTheLimit(OpenLoop):
         return estimate._replace(speed=speed)
 
 
-def assert_runs_do_not_depend_on_the_batch(setting, record):
-    """Runs are the same however many are played at once, and differ by their seed."""
-    worlds = choose_target(setting, record, "replaced", "hunter")
-    policy = make_policy(setting, "adaptive", worlds)
-    together = attack(setting, worlds, policy, 5, seed=3, progress=False)
-    parts = attack(setting, worlds, policy, 5, seed=3, batch=2, progress=False)
-    np.testing.assert_array_equal(together.scores, parts.scores)
-    np.testing.assert_array_equal(together.distances, parts.distances)
-    other = attack(setting, worlds, policy, 5, seed=4, progress=False)
-    assert not np.isin(other.scores, together.scores).any()
+def staying(segment, speed=0.0):
+    return Trajectory.constant(SECONDS, segment, speed)
+
+
+def runs_of(setting, worlds, n_runs=2, policy="hunter", **options):
+    """Attack with the plan of a policy, or one that is given."""
+    is_name = isinstance(policy, str)
+    queries = Planner(setting, policy).queries(worlds) if is_name else Queries(policy)
+    return attack(setting, worlds, queries, n_runs, progress=False, **options)
+
+
+def reached(setting, worlds, policy="hunter", n_runs=2):
+    """The largest distance of some runs over mu."""
+    distances = runs_of(setting, worlds, n_runs, policy).distances
+    return distances.max() / privacy_report(setting).mu

@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.audit.attack import attack
-from agents.audit.planner import choose_target, make_policy
+from agents.audit.planner import Planner
 from agents.audit.statistics import Claim, audit
-from agents.audit.strategies import FixedQueries
 from agents.audit.worlds import AdjacentWorlds, AuditedPenetration, Trajectory, audited
 from dptse_env.config import resolve
 from dptse_env.parts import make_task, privacy_report
 from dptse_env.release import Capped
 from dptse_env.traffic import Penetration, RecordLibrary
+
+from . import small
 
 HORIZON, SENSOR = 60, 3
 
@@ -47,8 +47,7 @@ def standing(record, segment=SENSOR):
 def reached(setting, worlds, segment=SENSOR, *, queried=True):
     plan = np.zeros((HORIZON, 6), dtype=bool)
     plan[:, segment] = queried
-    runs = attack(setting, worlds, FixedQueries(plan), 2, progress=False)
-    return runs.distances.max() / privacy_report(setting).mu
+    return small.reached(setting, worlds, plan)
 
 
 def test_a_vehicle_that_both_see_is_as_visible_as_the_account_says(record):
@@ -86,15 +85,13 @@ def test_groups_that_forget_their_shares_are_found_out(record):
 @pytest.mark.parametrize("preset", ["capped", "paced"])
 def test_the_worst_case_of_the_planner_reaches_most_of_mu(preset, adjacency, record):
     setting = config(preset, adjacency=adjacency)
-    worlds = choose_target(setting, record, "worst-case", "hunter")
-    runs = attack(setting, worlds, make_policy(setting, "hunter", worlds), 2, progress=False)
-    part = runs.distances.max() / privacy_report(setting).mu
-    assert 0.85 < part <= 1.0 + 1e-9
+    worlds = Planner(setting).choose(record, "worst-case")
+    assert 0.85 < small.reached(setting, worlds) <= 1.0 + 1e-9
 
 
 def test_other_kinds_of_targets_are_refused(record):
     with pytest.raises(ValueError, match="target must be one of"):
-        choose_target(config(), record, "deleted", "hunter")
+        Planner(config()).choose(record, "deleted")
 
 
 def test_both_worlds_have_the_same_connected_vehicles_and_the_target_is_one(record):
@@ -120,7 +117,5 @@ def test_scores_of_many_runs_agree_with_the_guarantee_and_weak_noise_does_not(re
     report = privacy_report(setting)
     claim = Claim(report.mu, report.claimed_epsilon, report.claimed_delta)
     for factor, verdict in ((1.0, "not rejected"), (0.6, "rejected")):
-        runs = attack(
-            setting, worlds, FixedQueries(plan), 3_000, noise_factor=factor, progress=False
-        )
+        runs = small.runs_of(setting, worlds, 3_000, plan, noise_factor=factor)
         assert audit(*runs.scores, claim).verdict == verdict

@@ -8,6 +8,7 @@ from agents.training.plan import TrainingPlan, parse_algorithm
 from tests.helpers import SHORT
 
 ENV = f'{SHORT} {{"horizon": 80, "privacy": "capped"}}'
+WIDE = f'{SHORT} {{"horizon": 80, "privacy": "capped", "bandwidth": 3}}'
 OTHER = 'dptse_env:dptse/PrivateHighway-v0 {"horizon": 80, "bandwidth": 3}'
 """A road of 15 segments beside one of 6; both have the same kinds of channels."""
 

@@ -28,7 +28,7 @@ from dptse_env.sb3 import load_policy
 from tests.agents.elsewhere import Elsewhere
 from tests.agents.training.plans import (
     ENV,
-    OTHER,
+    WIDE,
     StopError,
     kill_at,
     make_algorithm,
@@ -74,7 +74,7 @@ def killed(folder, update, **changes):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal for a process")
-@pytest.mark.parametrize(("update", "more"), [(0, ()), (1, ()), (2, ()), (2, (OTHER,))])
+@pytest.mark.parametrize(("update", "more"), [(0, ()), (1, ()), (2, ()), (2, (WIDE,))])
 def test_a_training_that_is_killed_goes_on_to_the_same_bits(update, more, whole, tmp_path):
     changes = {"envs": (ENV, *more)} if more else {}
     child = multiprocessing.get_context("spawn").Process(
@@ -222,17 +222,17 @@ def test_a_validation_is_seeded_and_leaves_the_draws_of_the_training_alone(whole
 
 
 def test_several_environments_teach_one_network(whole):
-    folder, rows = whole(envs=(ENV, OTHER))
-    regression, forks = 9 * (4 + 2), 1 + 2 * (1 + 2)
-    assert rows[-1]["steps"] == regression + 2 * (3 + 1) * 80 * forks
+    folder, rows = whole(envs=(ENV, WIDE))
+    regression, forks = 9 * (4 + 4), 1 + 2 * (1 + 2)
+    assert rows[-1]["steps"] == regression + 2 * (3 + 3) * 80 * forks
     for column in ("validation", "validation_drawn"):
         each = [row for name, row in rows[-1].items() if name.startswith(f"{column} in dptse_env")]
         assert len(each) == 2
         assert rows[-1][column] == pytest.approx(sum(each) / 2)
     policy = load_policy(folder / POLICY, make_env(make_plan()))
-    assert policy.card["training"]["also"] == [OTHER]
-    env = gym.make("dptse_env:dptse/PrivateHighway-v0", action="slots", bandwidth=3)
-    elsewhere = load_policy(folder / BEST, env, allow=("corridor", "bandwidth"))
+    assert policy.card["training"]["also"] == [WIDE]
+    env = make_env(make_plan(), bandwidth=3)
+    elsewhere = load_policy(folder / BEST, env, allow=("bandwidth",))
     assert env.action_space.contains(elsewhere.predict(env.reset(seed=0)[0])[0])
     one, two = (read_checkpoint(each)["policy"] for each in (folder, whole()[0]))
     assert not any(torch.equal(one[key], two[key]) for key in one)

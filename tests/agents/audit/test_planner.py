@@ -1,0 +1,305 @@
+"""Targets and queries of an attack, and the distances that they reach."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from agents.audit.planner import JAM_SPEED, KINDS, Planner, plan_contributions, public_plan
+from agents.audit.worlds import AdjacentWorlds, Trajectory
+from dptse_env.parts import privacy_report
+from tests.helpers import fast_and_slow
+
+from .small import HORIZON, ROAD, SECONDS, HalfTheLimit, config, paced, reached, staying
+
+# --- what a vehicle tells -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", ["paper", "corrected", "capped"])
+def test_moves_are_the_distance_of_a_second(preset, record):
+    setting = config(preset=preset)
+    planner, mu = Planner(setting), privacy_report(setting).mu
+    rows = np.linspace(0, record.n_rows - 1, 8).astype(int)
+    columns = (record.step, record.segment, record.speed)
+    everyone = Trajectory(*(column[rows].astype(np.int64) for column in columns[:2]),
+                          record.speed[rows].astype(np.float64))  # fmt: skip
+    inside = planner.moves(record, everyone, is_in_record=True)
+    for row, moves in zip(rows, inside, strict=True):
+        step, vehicle = int(record.step[row]), int(record.vehicle[row])
+        path = Trajectory.from_record(record, vehicle)
+        keep, moved = path.only(path.step != step), path.only(path.step == step)
+        rest = AdjacentWorlds(record.without(vehicle), (keep, keep)).get(ROAD, 0)
+        plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
+        plan[step - 1, int(record.segment[row])] = True
+        worlds = AdjacentWorlds(rest, (moved, Trajectory.absent()))
+        distance = mu * reached(setting, worlds, plan, 1)
+        assert distance**2 == pytest.approx(np.sum(moves**2), rel=1e-9)
+        outside = planner.moves(rest, moved)
+        assert distance**2 == pytest.approx(np.sum(outside**2), rel=1e-9)
+
+
+@pytest.mark.parametrize("preset", ["paper", "capped"])
+def test_where_paths_meet_speeds_alone_tell(preset, record):
+    setting = config(preset=preset)
+    paths = tuple(Trajectory.constant(np.array([20]), 2, speed) for speed in (5.0, 140.0))
+    plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
+    plan[19, 2] = True
+    distance = reached(setting, AdjacentWorlds(record, paths), plan, 1)
+    first, second = (Planner(setting).moves(record, path)[0] for path in paths)
+    assert record.counts[20, 2] > 0
+    assert first[0] == second[0]
+    expected = abs(first[1] - second[1]) / privacy_report(setting).mu
+    assert distance == pytest.approx(expected, rel=1e-9)
+    assert distance > 0.0
+
+
+def test_a_vehicle_that_pays_deviates_by_the_clip_at_most(record):
+    setting = paced(clip=20.0)
+    count, flow = Planner(setting).moves(record, staying(1)).T
+    np.testing.assert_allclose((flow / count) ** 2, setting.privacy.ratio)
+
+
+# --- targets --------------------------------------------------------------------------------------
+
+CAPPED = [
+    config(),
+    config(adjacency="add_remove", unit="event"),
+    config(boundary_inputs="private", cap=1),
+]
+MORE_CAPPED = [
+    config(adjacency="add_remove"),
+    config(share=0.2),
+    config(unit="horizon"),
+    config(unit="horizon", horizon=10),
+    config(unit="event"),
+    config(cap=500),
+    dataclasses.replace(config(), corridor=dataclasses.replace(ROAD, fixed_sensors=())),
+]
+
+
+@pytest.mark.parametrize("setting", fast_and_slow([*CAPPED, *MORE_CAPPED], CAPPED))
+def test_the_worst_case_is_the_whole_of_mu(setting, record):
+    worlds = Planner(setting).choose(record, "worst-case")
+    assert reached(setting, worlds) == pytest.approx(1.0, rel=1e-9)
+    seen_by_a_schedule = Planner(setting, "static").choose(record, "worst-case")
+    assert reached(setting, seen_by_a_schedule, "static") <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "open_loop"])
+@pytest.mark.parametrize("privacy", [{"clip": 25.0}, {"clip": 51.0}, {"unit": "event"}])
+def test_the_worst_case_is_nearly_the_whole_of_mu(estimator, privacy, record):
+    setting = paced(estimator, **privacy)
+    assert 0.97 < reached(setting, Planner(setting).choose(record, "worst-case")) <= 1.0
+
+
+def test_opposite_deviations_on_one_segment_are_a_worst_case(record):
+    """Two vehicles and one query, where the centre leaves room for the clip on both sides."""
+    for setting in (paced(HalfTheLimit, clip=51.0), config()):
+        worlds = Planner(setting).choose(record, "opposite")
+        slow, fast = worlds.trajectories
+        np.testing.assert_array_equal(slow.segment, fast.segment)
+        assert set(slow.speed.tolist()) == {0.0}
+        assert set(fast.speed.tolist()) == {ROAD.speed_limit}
+        # All that is told is the speed: nobody can tell the counts apart.
+        assert np.array_equal(*(worlds.get(ROAD, seed).counts for seed in (0, 1)))
+        part = reached(setting, worlds)
+        # Under capped contributions the other half of mu^2 is for the count.
+        least = 0.97 if setting.privacy.preset == "paced" else np.sqrt(0.5) - 1e-9
+        assert least < part <= 1.0 + 1e-9
+
+
+def test_a_lone_vehicle_is_the_worst_case_of_add_remove(record):
+    setting = paced(adjacency="add_remove")
+    worlds = Planner(setting).choose(record, "worst-case")
+    assert [len(path.step) for path in worlds.trajectories] == [HORIZON, 0]
+    assert 0.95 < reached(setting, worlds) <= 1.0
+
+
+PACED = [
+    {},
+    {"adjacency": "add_remove"},
+    {"adjacency": "add_remove", "ratio": 20.0},
+    {"unit": "event"},
+    {"unit": "event", "adjacency": "add_remove"},
+    {"boundary_inputs": "private"},
+    {"clip": 5.0, "ratio": 0.1},
+    {"pace": 0.05},
+    {"epsilon": 0.1},
+]
+FEW = [
+    ("deleted", config(cap=2), "round-robin"),
+    ("replaced", config(boundary_inputs="private"), "hunter"),
+    ("worst-case", paced("random_walk", adjacency="add_remove", ratio=20.0), "hunter"),
+    ("opposite", paced("random_walk", clip=5.0, ratio=0.1), "hunter"),
+    ("runs-out", paced("random_walk", pace=0.05), "round-robin"),
+    ("jam", paced("random_walk", unit="event"), "hunter"),
+]
+ALL = [
+    (kind, setting, policy)
+    for kind in KINDS
+    for policy, settings in (
+        ("hunter", [*(paced("random_walk", **each) for each in PACED), *CAPPED, *MORE_CAPPED]),
+        ("static", [paced("random_walk"), *CAPPED]),
+    )
+    for setting in settings
+    if setting.privacy.adjacency == "replace" or kind not in ("replaced", "opposite")
+    if (kind, setting, policy) not in FEW
+]
+
+
+@pytest.mark.parametrize(("kind", "setting", "policy"), fast_and_slow([*FEW, *ALL], FEW))
+def test_no_target_exceeds_mu(kind, setting, policy, record):
+    worlds = Planner(setting, policy).choose(record, kind)
+    assert reached(setting, worlds, policy) <= 1.0 + 1e-9
+    if setting.privacy.unit == "event":
+        assert {len(path.step) for path in worlds.trajectories} <= {0, 1}
+        assert len({int(step) for path in worlds.trajectories for step in path.step}) == 1
+
+
+@pytest.mark.parametrize("policy", ["hunter", "round-robin"])
+@pytest.mark.parametrize("setting", [config(preset="corrected"), config(cap=2), paced(pace=0.05)])
+def test_the_vehicle_that_is_deleted_tells_most(setting, policy, record):
+    chosen = reached(setting, Planner(setting, policy).choose(record, "deleted"), policy)
+    everyone = []
+    for vehicle in range(record.n_vehicles):
+        pair = Trajectory.from_record(record, vehicle), Trajectory.absent()
+        everyone.append(reached(setting, AdjacentWorlds(record.without(vehicle), pair), policy))
+    # Prices are those of a typical episode, so that it is not always the best.
+    least = 0.95 if setting.privacy.preset == "paced" else 1.0 - 1e-9
+    assert chosen >= least * max(everyone)
+    assert chosen > 1.02 * np.median(everyone)
+
+
+def test_a_replaced_vehicle_tells_more_than_a_deleted_one(record):
+    for setting in (config(preset="corrected"), config()):
+        planner = Planner(setting)
+        kinds = ("replaced", "deleted")
+        replaced, deleted = (reached(setting, planner.choose(record, kind)) for kind in kinds)
+        assert replaced > 1.2 * deleted
+
+
+def test_targets_of_the_record_are_what_they_are_called(record):
+    planner = Planner(paced())
+    whole = {kind: planner.rank(record, kind).tolist() for kind in KINDS}
+    jammed = [np.sum(record.speed[record.vehicle == v] < JAM_SPEED) for v in whole["jam"]]
+    assert jammed == sorted(jammed, reverse=True)
+    first = [record.step[record.vehicle == v].min() for v in range(record.n_vehicles)]
+    late = [v for v in whole["late"] if first[v] > HORIZON / 2]
+    assert whole["late"][: len(late)] == late != []
+    # With the largest unpaid demand: more seconds than the two that count.
+    road = dataclasses.replace(ROAD, fixed_sensors=())
+    capped = Planner(dataclasses.replace(config(cap=2), corridor=road))
+    paths = [Trajectory.from_record(record, v) for v in capped.rank(record, "runs-out")]
+    squares = [np.sort(np.sum(capped.moves(record, path) ** 2, axis=1)) for path in paths]
+    assert np.diff([each[:-2].sum() for each in squares]).max() <= 1e-9
+    # It would pay on if its ledger held more.
+    worlds = planner.choose(record, "runs-out")
+    rich = paced(epsilon=1e4)
+    assert reached(rich, worlds) * privacy_report(rich).mu > 1.2 * privacy_report(paced()).mu
+
+
+@pytest.mark.parametrize(
+    ("setting", "kind"),
+    [
+        (config(adjacency="add_remove"), "replaced"),
+        (paced(adjacency="add_remove"), "opposite"),
+        (config(), "nobody"),
+    ],
+)
+def test_targets_that_do_not_fit_are_named(setting, kind, record):
+    with pytest.raises(ValueError, match=rf"target must be one of \[.*\].* got '{kind}'"):
+        Planner(setting).choose(record, kind)
+
+
+@pytest.mark.parametrize(("kind", "need"), [("deleted", 1), ("replaced", 2)])
+def test_an_empty_road_has_no_target(kind, need, record):
+    empty = record
+    for vehicle in range(need - 1, record.n_vehicles):
+        empty = empty.without(vehicle)
+    with pytest.raises(ValueError, match=f"traffic must be a record of {need}"):
+        Planner(config()).choose(empty, kind)
+
+
+# --- queries --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bandwidth", [1, 2, 6])
+def test_the_hunter_keeps_to_bandwidth_and_cap(bandwidth, record):
+    setting = config(bandwidth, cap=7)
+    worlds = AdjacentWorlds(record, (staying(0), staying(1)))
+    plan = Planner(setting).plan(worlds)
+    assert plan.sum(axis=1).max() <= bandwidth
+    assert plan.sum() == 14  # seven for each of the two paths
+    assert reached(setting, worlds) == pytest.approx(1.0)
+
+
+def test_the_hunter_queries_the_seconds_that_reveal_most(record):
+    path = Trajectory.from_record(record, 0)
+    worlds = AdjacentWorlds(record.without(0), (path, Trajectory.absent()))
+    # The fixed sensor at the end of the road comes after them.
+    free = path.only(path.segment < 5)
+    best = free.step[np.argsort(-np.abs(np.clip(free.speed, 0, 102) - 51.0))[:3]]
+    plan = Planner(config(cap=3)).plan(worlds)
+    assert set(np.flatnonzero(plan.any(axis=1)) + 1) == set(best.tolist())
+    assert plan.sum() == 3
+
+
+def test_the_hunter_queries_where_the_two_trajectories_part(record):
+    seconds = np.arange(1, 21)
+    # One stands where the other drives by; then they are apart, and both a little slower to tell.
+    together = np.where(seconds <= 10, 1, 2), np.where(seconds <= 10, 1, 3)
+    speeds = (np.where(seconds <= 10, first, 20.0) for first in (0.0, 80.0))
+    paths = tuple(map(Trajectory, (seconds, seconds), together, speeds))
+    plan = Planner(config(bandwidth=2, cap=4)).plan(AdjacentWorlds(record, paths))
+    assert plan[:10].sum() == 0
+    assert plan[10:20, [2, 3]].sum() == plan.sum() == 8
+
+
+@pytest.mark.parametrize("bandwidth", [1, 2, 5])
+def test_the_hunter_of_ledgers_follows_both_vehicles_every_second(bandwidth, record):
+    setting = paced(bandwidth=bandwidth)
+    places = SECONDS // 7 % 5, (SECONDS // 5 + 2) % 5
+    paths = tuple(Trajectory(SECONDS, place, np.full(HORIZON, 30.0)) for place in places)
+    plan = Planner(setting).plan(AdjacentWorlds(record, paths))
+    followed = np.stack([plan[np.arange(HORIZON), place] for place in places])
+    if bandwidth == 1:
+        assert (followed[0] | followed[1]).all()
+        assert followed[0][::2].all()
+        assert followed[1][1::2].all()
+    else:
+        assert followed.all()
+    # What is left goes round; nothing is needed where a sensor stands.
+    assert (plan.sum(axis=1) == bandwidth).all()
+    assert bandwidth < 5 or (plan.sum(axis=0) > 0).all()
+    sensor = AdjacentWorlds(record, (staying(ROAD.fixed_sensors[0]), Trajectory.absent()))
+    np.testing.assert_array_equal(
+        Planner(setting).plan(sensor), public_plan(setting, "round-robin")
+    )
+
+
+def test_contributions_are_spent_where_they_tell_most():
+    generator = np.random.default_rng(2)
+    for cap in (1, 2, 3, 5, 8):
+        for _ in range(20):
+            gains, always = generator.random(7), generator.random(7) < 0.4
+            reach, n_queries, stop = plan_contributions(gains, always, cap)
+            # Every set of seconds to query; the first that are observed count.
+            options = []
+            for queried in range(2**7):
+                observed = always | (queried >> np.arange(7) & 1).astype(bool)
+                options.append(gains[np.flatnonzero(observed)[:cap]].sum())
+            assert reach == pytest.approx(max(options))
+            best = np.flatnonzero(~always[:stop])
+            best = best[np.argsort(-gains[best])][:n_queries]
+            observed = always.copy()
+            observed[best] = True
+            assert gains[np.flatnonzero(observed)[:cap]].sum() == pytest.approx(max(options))
+
+
+def test_public_schedules_are_those_of_the_environment():
+    plan = public_plan(config(), "paper")
+    # Two of six segments, shifted downstream every four seconds.
+    assert [np.flatnonzero(row).tolist() for row in plan[[0, 3, 4, 8]]] == [
+        [0, 3], [0, 3], [1, 4], [2, 5],
+    ]  # fmt: skip
+    assert plan.shape == (HORIZON, ROAD.n_mainline)
