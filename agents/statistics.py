@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,18 +67,6 @@ def geometric_mean_interval(values: ArrayLike) -> Interval:
     logs = mean_interval(np.log(array))
     mean, low, high = (float(np.exp(end)) for end in (logs.mean, logs.low, logs.high))
     return Interval(mean, low, high, logs.n)
-
-
-def paired_difference(values: ArrayLike, reference: ArrayLike) -> Interval:
-    """Return the mean of ``values - reference``, paired by position, with its 95 % interval.
-
-    Raises:
-        ValueError: The two do not pair up.
-    """
-    a, b = np.asarray(values, dtype=np.float64), np.asarray(reference, dtype=np.float64)
-    if a.shape != b.shape:
-        raise ValueError(f"paired values must have one shape, got {a.shape} and {b.shape}")
-    return mean_interval(a - b)
 
 
 def mean(table: FloatArray) -> FloatArray:
@@ -188,24 +176,14 @@ def crossed_t(table: ArrayLike) -> tuple[Interval, float]:
     return Interval(float(centre), float(low), float(high), n_columns), float(p_value)
 
 
-def holm(p_values: Mapping[str, float]) -> dict[str, float]:
-    """Return p-values adjusted by Holm's (1979) step-down procedure.
+def holm(p_values: Sequence[float]) -> float:
+    """Return the largest of some p-values, adjusted by Holm's (1979) step-down procedure.
 
-    Rejecting where the adjusted value is below alpha keeps the family-wise error rate at alpha,
-    however the tests depend on one another.
-
-    Raises:
-        ValueError: A value is not in [0, 1].
+    Where it is below alpha, all are rejected with a family-wise error rate of alpha, however the
+    tests depend on one another. Of none it is 1.
     """
-    for name, value in p_values.items():
-        if not 0.0 <= value <= 1.0:
-            raise ValueError(f"p-values must be in [0, 1], got {value!r} for {name}")
-    adjusted: dict[str, float] = {}
-    largest = 0.0
-    for rank, name in enumerate(sorted(p_values, key=lambda name: p_values[name])):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[name]))
-        adjusted[name] = largest
-    return {name: adjusted[name] for name in p_values}
+    steps = [(len(p_values) - k) * each for k, each in enumerate(sorted(p_values))]
+    return min(1.0, max(steps, default=1.0))
 
 
 def _paired_tables(tables: Sequence[ArrayLike]) -> list[FloatArray]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from agents.statistics import Interval, mean_interval, paired_difference
+from agents.statistics import Interval, mean_interval
 from dptse_env.utils.arrays import FloatArray
 
 DENSITY, SPEED, ERROR = "rmse_density", "rmse_speed", "error"
@@ -109,8 +109,8 @@ def mean(rows: pl.DataFrame, labels: Labels, metric: str) -> Interval:
 
 def difference(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str) -> Interval:
     """Return by how much a cell exceeds a reference, paired by traffic and noise."""
-    pair = pick_paired(rows, labels, reference)
-    return paired_difference(*(values_of(each, metric) for each in pair))
+    own, other = (values_of(each, metric) for each in pick_paired(rows, labels, reference))
+    return mean_interval(own - other)
 
 
 def below(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str = ERROR) -> Interval:

@@ -8,7 +8,6 @@ budget. All cells have the same traffic; a number of one part is never held agai
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -18,6 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import polars as pl
+from matplotlib.figure import Figure
 
 from agents.environments import make_config, quietly
 from agents.figures import (
@@ -28,7 +28,7 @@ from agents.figures import (
     draw_level,
     finish_figure,
     make_figure,
-    save_figure,
+    save_measured,
     set_log_axes,
     set_log_ticks,
 )
@@ -38,7 +38,6 @@ from agents.study import Study
 from agents.tables import (
     DENSITY,
     METRICS,
-    UnmeasuredError,
     cell,
     difference,
     error_label,
@@ -444,7 +443,7 @@ LOOKS = {
 }
 
 
-def draw_price(rows: pl.DataFrame, path: Path) -> None:
+def draw_price(rows: pl.DataFrame) -> Figure:
     """Draw errors against epsilon for every protection and estimator."""
     figure = make_figure(9.4, 7.0, dpi=120)
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
@@ -458,10 +457,10 @@ def draw_price(rows: pl.DataFrame, path: Path) -> None:
         axis.set_title(LABELS[name], fontsize=9, loc="left")
         axis.set_xlabel("ε claimed")
         axis.set_ylabel(error_label(metric))
-    save_figure(finish_figure(figure), path, f"Errors against the claimed ε, δ = {DELTA:g}")
+    return finish_figure(figure)
 
 
-def draw_claimed(_: pl.DataFrame, path: Path) -> None:
+def draw_claimed(_: pl.DataFrame) -> Figure:
     """Draw epsilon claimed against epsilon true."""
     figure = make_figure(6.4, 4.4, dpi=120)
     axis = figure.subplots()
@@ -474,10 +473,10 @@ def draw_claimed(_: pl.DataFrame, path: Path) -> None:
     set_log_ticks(axis.yaxis, [10.0**k for k in range(-1, 7)])
     axis.set_xlabel("ε claimed")
     axis.set_ylabel("ε true")
-    save_figure(finish_figure(figure, columns=2), path, f"ε claimed and true, δ = {DELTA:g}")
+    return finish_figure(figure, columns=2)
 
 
-def draw_ladder(rows: pl.DataFrame, path: Path) -> None:
+def draw_ladder(rows: pl.DataFrame) -> Figure:
     """Draw the errors of every rung, from top to bottom."""
     rungs = {
         label.replace("`", ""): {
@@ -485,11 +484,10 @@ def draw_ladder(rows: pl.DataFrame, path: Path) -> None:
         }
         for label, changes, _ in LADDER
     }
-    title = f"(ε, δ) = (5, {DELTA:g}) for a whole trip, replaced"
-    save_figure(draw_errors(list(rungs), {"": rungs}), path, title)
+    return draw_errors(list(rungs), {"": rungs})
 
 
-def draw_budgets(rows: pl.DataFrame, path: Path) -> None:
+def draw_budgets(rows: pl.DataFrame) -> Figure:
     """Draw the contributions that were refused, by length of trip and by place."""
     figure = make_figure(9.8, 4.4, dpi=120)
     axes = figure.subplots(1, 2)
@@ -507,8 +505,7 @@ def draw_budgets(rows: pl.DataFrame, path: Path) -> None:
     axes[0].set_xlabel("time on the mainline [s]")
     axes[1].set_xlabel("mainline segment")
     axes[0].set_ylabel("contributions refused [%]")
-    title = "Who runs out (true traffic, for evaluation alone)"
-    save_figure(finish_figure(figure), path, title)
+    return finish_figure(figure)
 
 
 def refused_shares(rows: pl.DataFrame, suffix: str) -> dict[int, Interval]:
@@ -531,7 +528,12 @@ def refused_shares(rows: pl.DataFrame, suffix: str) -> dict[int, Interval]:
     }
 
 
-FIGURES = (draw_price, draw_claimed, draw_ladder, draw_budgets)
+FIGURES = {
+    "fig_price.png": (draw_price, f"Errors against the claimed ε, δ = {DELTA:g}"),
+    "fig_claimed.png": (draw_claimed, f"ε claimed and true, δ = {DELTA:g}"),
+    "fig_ladder.png": (draw_ladder, f"(ε, δ) = (5, {DELTA:g}) for a whole trip, replaced"),
+    "fig_budgets.png": (draw_budgets, "Who runs out (true traffic, for evaluation alone)"),
+}
 
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
@@ -541,9 +543,8 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     rows = rows.with_columns(pl.lit(None).alias(name) for name in names.keys() - {*rows.columns})
     met = pl.col("n_met").cast(pl.Float64).clip(1.0)
     rows = rows.with_columns((100.0 * pl.col("n_refused") / met).alias(REFUSED))
-    for draw in FIGURES:
-        with contextlib.suppress(UnmeasuredError):
-            draw(rows, folder / f"{draw.__name__.replace('draw', 'fig')}.png")
+    for name, (draw, title) in FIGURES.items():
+        save_measured(folder / name, title, draw, rows)
     lost = rows.group_by("part", "estimator").agg(
         pl.len().alias("episodes"),
         pl.col("n_diverged").sum().cast(int).alias("started over [s]"),

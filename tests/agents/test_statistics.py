@@ -12,7 +12,6 @@ from agents.statistics import (
     holm,
     mean,
     mean_interval,
-    paired_difference,
     percent_below,
     percent_of_way,
 )
@@ -30,14 +29,6 @@ def test_the_interval_is_students_and_covers_as_often_as_it_says():
     assert mean_interval([2.0, 2.0]) == Interval(2.0, 2.0, 2.0, 2)
 
 
-def test_pairing_removes_what_the_two_share():
-    generator = np.random.default_rng(0)
-    shared = 100 * generator.standard_normal(20)
-    difference = paired_difference(shared + 1.0 + 0.1 * generator.standard_normal(20), shared)
-    assert difference.low > 0.0
-    assert difference.mean == pytest.approx(1.0, abs=0.1)
-
-
 def test_a_geometric_interval_is_the_same_for_inverse_ratios():
     values = np.array([0.5, 1.0, 4.0, 3.0])
     mean, inverse = geometric_mean_interval(values), geometric_mean_interval(1.0 / values)
@@ -50,7 +41,6 @@ def test_a_geometric_interval_is_the_same_for_inverse_ratios():
 REFUSED = [
     (mean_interval, ([1.0],), "at least 2 values"),
     (mean_interval, ([1.0, float("nan")],), "finite"),
-    (paired_difference, ([1, 2], [1, 2, 3]), r"one shape, got \(2,\) and \(3,\)"),
     (geometric_mean_interval, ([1.0, 0.0],), "must be above zero"),
     (geometric_mean_interval, ([1.0, np.nan],), "must be above zero"),
     (bootstrap, (mean, np.ones((5, 1))), r"2 traffic seeds, got shape \(5, 1\)"),
@@ -59,8 +49,6 @@ REFUSED = [
     (bootstrap, (mean, np.array([[1.0, np.nan]])), "values must be finite, 1 are not"),
     (bootstrap, (percent_below, np.ones((2, 4)), np.ones(5)), "same traffic seeds"),
     (bootstrap, (percent_below, np.ones(3), np.array([-1.0, 0.0, 1.0])), "every resample"),
-    (holm, ({"x": -0.1},), r"p-values must be in \[0, 1\], got .* for x"),
-    (holm, ({"x": np.nan},), r"p-values must be in \[0, 1\], got .* for x"),
 ]
 
 
@@ -166,8 +154,6 @@ def test_crossed_t_of_equal_values():
 
 def test_holm_steps_down():
     # Holm (1979); the values of R's p.adjust(c(0.01, 0.04, 0.03, 0.005), "holm").
-    adjusted = holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": 0.005})
-    assert adjusted == pytest.approx({"a": 0.03, "b": 0.06, "c": 0.06, "d": 0.02})
-    assert list(adjusted) == ["a", "b", "c", "d"]
-    assert holm({"a": 0.6, "b": 0.7}) == {"a": 1.0, "b": 1.0}
-    assert holm({}) == {}
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx(0.06)
+    assert holm([0.01, 0.03]) == pytest.approx(0.03)
+    assert holm([0.6, 0.7]) == holm([]) == 1.0

@@ -33,7 +33,7 @@ def line_of(text, start):
 
 
 def test_the_tables_are_those_of_the_rows(rows, tmp_path, monkeypatch):
-    monkeypatch.setattr(guarantees, "FIGURES", ())
+    monkeypatch.setattr(guarantees, "FIGURES", {})
     text = report(rows, tmp_path)
     paced, capped = (
         values(rows, paid(release=each).labels, DENSITY) for each in ("paced", "capped")
