@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from agents.environments import quietly, unwrap
+from agents.figures import COLOURS
 from agents.play import Cell
 from agents.tables import error_label
 from dptse_env.evaluation import Row, evaluate
@@ -25,7 +26,6 @@ FRAMES = 140
 """Most positions of the slider: more would make the page large and slow."""
 
 TRUTH = "#444444"
-COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
 
 
 class Watched:
@@ -104,22 +104,23 @@ def write_page(
 
     first = episodes[0].history
     n_rows = 3 + len(episodes)
-    titles = ["Errors of all policies", f"True density, traffic seed {seed} [veh/km]"]
-    for each in episodes:
-        titles.append(f"{each.name}: estimate [veh/km], and what it queried")
     figure = make_subplots(
         rows=n_rows,
         cols=1,
-        subplot_titles=[*titles, "Along the road at the second of the slider [veh/km]"],
+        subplot_titles=[
+            "Errors of all policies",
+            f"True density, traffic seed {seed} [veh/km]",
+            *(f"{each.name}: estimate [veh/km], and what it queried" for each in episodes),
+            "Along the road at the second of the slider [veh/km]",
+        ],
         row_heights=[0.8, *[1.0] * (1 + len(episodes)), 1.4],
         vertical_spacing=0.36 / n_rows,
     )
     for metric, colour in zip(errors[0][1], COLOURS, strict=False):
-        spread = {"type": "data", "array": [each[metric][1] for _, each in errors]}
         figure.add_bar(
             x=[name for name, _ in errors],
             y=[each[metric][0] for _, each in errors],
-            error_y=spread,
+            error_y={"type": "data", "array": [each[metric][1] for _, each in errors]},
             name=error_label(metric),
             marker_color=colour,
             row=1,
@@ -128,12 +129,12 @@ def write_page(
     places = np.cumsum([0.0, *first.lengths])
     largest = max(first.density_scale, float(np.max(first.truth)))
     shades = {"coloraxis": "coloraxis", "x": list(range(len(first.truth))), "y": places.round(3)}
-    figure.add_heatmap(z=_columns(first.truth), name="truth", **shades, row=2, col=1)
     middles = (places[:-1] + places[1:]) / 2
-    for k, each in enumerate(episodes):
-        figure.add_heatmap(
-            z=_columns(each.history.estimate), name=each.name, **shades, row=3 + k, col=1
-        )
+    maps = [("truth", first.truth), *((each.name, each.history.estimate) for each in episodes)]
+    for row, (name, densities) in enumerate(maps, 2):
+        columns = np.array(densities).T.round(1)
+        figure.add_heatmap(z=columns, name=name, **shades, row=row, col=1)
+    for row, each in enumerate(episodes, 3):
         seconds, segments = np.nonzero(np.array(each.history.queried))
         figure.add_scattergl(
             x=seconds,
@@ -142,7 +143,7 @@ def write_page(
             marker={"size": 2, "color": "white", "opacity": 0.6},
             hoverinfo="skip",
             showlegend=False,
-            row=3 + k,
+            row=row,
             col=1,
         )
     n_fixed = len(figure.data)
@@ -172,11 +173,6 @@ def write_page(
     figure.update_yaxes(range=[0, largest], row=n_rows, col=1)
     # Playing at once would draw the moving curves alone.
     write_atomically(path, figure.to_html(include_plotlyjs=True, auto_play=False))
-
-
-def _columns(seconds: Sequence[Any]) -> Any:
-    """Return a map with a row for each segment, to a tenth."""
-    return np.array(seconds).T.round(1)
 
 
 def _profile(go: Any, episodes: Sequence[Watched], middles: FloatArray, second: int) -> list[Any]:

@@ -12,8 +12,8 @@ from scipy import stats
 
 from dptse_env.evaluation import WARM_UP, Row, WatcherFactory
 from dptse_env.process import QueryProcess
-from dptse_env.release import Capped, Paced, ReleaseModel
-from dptse_env.release.vehicles import Ledgers, VehicleRows
+from dptse_env.release import Capped, Paced
+from dptse_env.release.vehicles import VehicleRows
 from dptse_env.traffic import draw_scenario
 from dptse_env.traffic.demand import Incident
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
@@ -44,8 +44,10 @@ class Contributions:
 
     def __init__(self, process: QueryProcess) -> None:
         """Prepare for the episodes of a process."""
-        self._process, self._ledgers = process, ledgers_of(process.release)
         task = process.release.task
+        if not isinstance(process.release, Paced | Capped):
+            raise ValueError(f"privacy.preset must keep account of vehicles, got {task.name!r}")
+        self._process, self._ledgers = process, process.release.ledgers
         self._is_cleared = isinstance(process.release, Paced) and task.settings.unit == "event"
         self._covers = task.covers[task.group == 0]
         shape = (process.n_episodes, process.interface.n_mainline)
@@ -100,17 +102,6 @@ class Contributions:
             "met_of": by_length(self._met_of),
             "refused_of": by_length(self._refused_of),
         }
-
-
-def ledgers_of(release: ReleaseModel) -> Ledgers:
-    """Return what vehicles have paid.
-
-    Raises:
-        ValueError: The release model keeps no account of single vehicles.
-    """
-    if isinstance(release, Paced | Capped):
-        return release.ledgers
-    raise ValueError(f"privacy.preset must keep account of vehicles, got {release.task.name!r}")
 
 
 LEVELS = (50, 90, 95)

@@ -11,10 +11,10 @@ from agents.play import Cell, play
 from agents.watchers import (
     LENGTHS,
     PHASES,
+    Contributions,
     Honesty,
     by_offset,
     by_segment,
-    ledgers_of,
     near_since_start,
     regimes,
 )
@@ -108,7 +108,7 @@ def test_nobody_runs_out_where_every_second_has_a_budget_and_boundaries_are_met_
 def test_a_release_model_without_accounts_is_refused():
     release = make_release(make_config(SHORT, {"privacy": {"preset": "corrected"}}))
     with pytest.raises(ValueError, match=r"privacy\.preset must keep account .* got 'corrected'"):
-        ledgers_of(release)
+        Contributions(SimpleNamespace(release=release))
 
 
 def test_regimes_part_the_occupied_segments():
