@@ -89,16 +89,15 @@ def test_maps_stand_in_columns_with_one_bar(episode, tmp_path):
         assert saved.format == "PNG"
 
 
-def test_errors_of_every_policy_are_drawn(tmp_path):
-    pair = {
-        "rmse_density": Interval(10.0, 9.0, 11.0, 3), "rmse_speed": Interval(5.0, 4.0, 6.0, 3),
-    }  # fmt: skip
+def test_errors_of_every_policy_are_drawn_from_top_to_bottom():
+    pair = {"density": Interval(10.0, 9.0, 11.0, 3), "speed": Interval(5.0, 4.0, 6.0, 3)}
     rows = ["paper", "round-robin"]
-    series = {name: dict.fromkeys(rows, pair) for name in ("ekf", "ukf")}
-    save_figure(draw_errors(rows, series), tmp_path / "errors.png", "title")
-    with Image.open(tmp_path / "errors.png") as image:
-        # Something is drawn: neither one colour nor the few of an empty frame.
-        assert len(image.convert("RGB").getcolors(maxcolors=2**20)) > 100
+    figure = draw_errors(rows, {"ekf": dict.fromkeys(rows, pair), "ukf": {"paper": pair}})
+    for axis, (name, interval) in zip(figure.axes, pair.items(), strict=True):
+        assert axis.get_xlabel() == name
+        assert [text.get_text() for text in axis.texts] == [f"{interval.mean:.1f}"] * 3
+        assert [text.xy[1] for text in axis.texts] == [0.15, -0.15, -1.0]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ekf", "ukf"]
 
 
 def test_the_page_has_what_happened_and_needs_no_network(episode, tmp_path, monkeypatch):
