@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +18,7 @@ from matplotlib.ticker import FixedLocator, NullLocator
 from numpy.typing import ArrayLike, NDArray
 
 from agents.statistics import Interval
-from agents.tables import UnmeasuredError, error_label
+from agents.tables import UnmeasuredError
 from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import replacing
@@ -57,18 +58,11 @@ def add_frame(axis: Axes, lines: Literal["both", "x", "y"] = "both") -> None:
     axis.tick_params(labelsize=8)
 
 
-def finish_figure(
-    figure: Figure,
-    named: Iterable[Axes] | None = None,
-    columns: int = 5,
-    margin: float | None = None,
-) -> Figure:
-    """Frame all panels, and name the curves of some of them, by default of all, below them."""
+def finish_figure(figure: Figure, columns: int = 5) -> Figure:
+    """Frame all panels, and name their curves below them."""
     for axis in figure.axes:
         add_frame(axis)
-        if margin is not None:
-            axis.margins(x=margin)
-    add_legend(figure, figure.axes if named is None else named, columns)
+    add_legend(figure, figure.axes, columns)
     return figure
 
 
@@ -101,7 +95,7 @@ def spread(intervals: Sequence[Interval]) -> FloatArray:
     return np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
 
 
-def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: str | None) -> None:
+def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: str) -> None:
     """Draw a mean with its interval at a height, and its value beside it."""
     axis.errorbar(
         [interval.mean], [place], xerr=spread([interval]), color=colour, label=label,
@@ -113,39 +107,39 @@ def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: s
     )  # fmt: skip
 
 
-def save_errors(
-    path: Path,
+def draw_errors(
     rows: Sequence[str],
     series: Mapping[str, Mapping[str, Mapping[str, Interval]]],
-    title: str,
-) -> None:
-    """Save the errors of every policy as dots with 95 % intervals, a panel for each error.
+    log: bool = True,
+) -> Figure:
+    """Draw dots with 95 % intervals, a panel for each of some errors.
 
     Args:
-        path: Where to save the PNG.
-        rows: Policies, from top to bottom.
-        series: By estimator, policy and error, the same errors for all: intervals.
-        title: Title of the figure.
+        rows: What stands from top to bottom, such as policies.
+        series: By colour, row and error, the same errors for all: intervals.
+        log: Whether the errors stand on logarithmic axes.
     """
-    metrics = list(next(iter(series.values()))[rows[0]])
-    figure = make_figure(2.4 + 3.0 * len(metrics), 1.6 + 0.42 * len(rows), dpi=150)
-    axes = figure.subplots(1, len(metrics), sharey=True)
-    places = np.arange(len(rows))[::-1]
-    for axis, metric in zip(axes, metrics, strict=True):
-        for k, (name, intervals) in enumerate(series.items()):
-            shift = ((len(series) - 1) / 2 - k) * 0.3
-            for place, row in zip(places, rows, strict=True):
-                label = name if row == rows[0] else None
-                colour = COLOURS[k % len(COLOURS)]
-                draw_dot(axis, intervals[row][metric], place + shift, colour, label)
-        axis.set_xscale("log")
-        set_log_ticks(axis.xaxis, ERROR_TICKS)
+    panels = list(next(each[row] for each in series.values() for row in rows if row in each))
+    colours = dict(zip(series, cycle(COLOURS), strict=False))
+    most = max(sum(row in each for each in series.values()) for row in rows)
+    height = 1.6 + (0.18 + 0.12 * most) * len(rows)
+    figure = make_figure(2.4 + 2.6 * len(panels), height, dpi=120)
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axis, panel in zip(axes, panels, strict=True):
+        for place, row in enumerate(rows):
+            own = {name: each[row][panel] for name, each in series.items() if row in each}
+            for k, (name, interval) in enumerate(own.items()):
+                shift = ((len(own) - 1) / 2 - k) * 0.3
+                draw_dot(axis, interval, shift - place, colours[name], name)
+        if log:
+            axis.set_xscale("log")
+            set_log_ticks(axis.xaxis, ERROR_TICKS)
         axis.margins(x=0.12)
-        axis.set_xlabel(error_label(metric))
+        axis.set_xlabel(panel, fontsize=9)
         add_frame(axis, "x")
-    axes[0].set_yticks(places, rows)
+    axes[0].set_yticks([-place for place in range(len(rows))], rows)
     add_legend(figure, axes[:1])
-    save_figure(figure, path, title)
+    return figure
 
 
 @dataclass(frozen=True)

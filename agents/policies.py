@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from gymnasium import spaces
@@ -187,7 +187,15 @@ class SavedModel:
                 raise ValueError(
                     f"{self.source!r} has the {name} {own}, the environment has {given}"
                 )
-        return _Masked(model, bare) if self.keywords["action"] == "sequential" else model
+        policy: Policy = model
+        takes_masks = "action_masks" in inspect.signature(model.predict).parameters
+        if takes_masks and self.keywords["action"] == "sequential":
+
+            def predict(*given: Any, **more: Any) -> Any:
+                return model.predict(*given, **more, action_masks=bare.action_masks())
+
+            policy = SimpleNamespace(predict=predict)
+        return policy
 
 
 _ENCODINGS = {
@@ -202,28 +210,6 @@ _ENCODINGS = {
 def _size(space: Any) -> Any:
     """Return the number of choices of a discrete space."""
     return getattr(space, "n", None) if not hasattr(space, "nvec") else space.nvec.tolist()
-
-
-class _Masked:
-    """A model that picks one option at a time, among those that may be picked."""
-
-    def __init__(self, model: Any, env: Any) -> None:
-        self._model, self._env = model, env
-        self._takes_masks = "action_masks" in inspect.signature(model.predict).parameters
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = False,
-    ) -> tuple[Any, Any]:
-        """See `Policy.predict`."""
-        masks = {"action_masks": self._env.action_masks()} if self._takes_masks else {}
-        found: tuple[Any, Any] = self._model.predict(
-            observation, state, episode_start, deterministic, **masks
-        )
-        return found
 
 
 PolicySource = NamedSchedule | SavedPolicy | SavedModel

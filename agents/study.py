@@ -12,6 +12,7 @@ import hashlib
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +21,6 @@ import polars as pl
 import dptse_env
 from agents.executors import AnyExecutor, ThisProcess, run_shown
 from agents.play import Cell, corridor_of, play, record
-from dptse_env.evaluation import Row
 from dptse_env.traffic import Records
 from dptse_env.utils.files import replacing, write_atomically
 
@@ -122,30 +122,27 @@ def _footer(rows: pl.DataFrame) -> str:
 
 def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: bool) -> None:
     """Play the cells that the rows lack, and pack all rows into one file."""
-    unique = list({cell.id: cell for cell in cells}.values())
-    present = read_rows(study.name, place.folder)
-    played = _played(present)
+    rows = read_rows(study.name, place.folder)
+    played = dict(rows.group_by("cell").agg("traffic_seed").iter_rows())
     missing = [
-        cell for cell in unique if not set(study.seeds_of(cell)) <= played.get(cell.id, set())
+        (cell, study.seeds_of(cell))
+        for cell_id, cell in {cell.id: cell for cell in cells}.items()
+        if not set(study.seeds_of(cell)) <= set(played.get(cell_id, ()))
     ]
-    for cell in missing:
+    for cell, _ in missing:
         cell.check()
-    corridors = {(corridor_of(cell), study.seeds_of(cell)): None for cell in missing}
-    for corridor, seeds in corridors:
+    for corridor, seeds in dict.fromkeys((corridor_of(cell), seeds) for cell, seeds in missing):
         record(corridor, seeds, place.records, progress=progress)
     folder = place.folder / "rows"
     threads = None if isinstance(place.executor, ThisProcess) else 1
-    tasks = [
-        _Task(study.name, cell, study.seeds_of(cell), place.records, threads) for cell in missing
-    ]
     if missing:
         folder.mkdir(exist_ok=True)
     run_shown(
         place.executor,
-        _play_task,
-        tasks,
-        lambda task, rows: write_table(_file_of(folder, task.cell.id), rows),
-        size=lambda task: len(task.seeds),
+        partial(_play_cell, study.name, place.records, threads),
+        missing,
+        lambda task, rows: write_table(_file_of(folder, task[0].id), rows),
+        size=lambda task: len(task[1]),
         progress=progress,
         desc=study.name,
         unit="episode",
@@ -157,45 +154,26 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
         shutil.rmtree(folder)
 
 
-class _Task(NamedTuple):
-    """A cell with everything that a worker needs."""
-
-    study: str
-    cell: Cell
-    seeds: tuple[int, ...]
-    records: Records
-    threads: int | None
-
-
-def _play_task(task: _Task) -> pl.DataFrame:
-    rows = play(task.cell, task.seeds, task.records, task.threads)
-    return table_of(task.study, task.cell, rows)
-
-
-def table_of(study: str, cell: Cell, rows: Sequence[Row]) -> pl.DataFrame:
-    """Return the rows of a cell with their origin and its labels.
+def _play_cell(
+    study: str, records: Records, threads: int | None, task: tuple[Cell, tuple[int, ...]]
+) -> pl.DataFrame:
+    """Play a cell, and return its rows with their origin and its labels.
 
     Raises:
         ValueError: A label is named like a measured column.
     """
+    cell, seeds = task
+    rows = play(cell, seeds, records, threads)
     clash = sorted(cell.labels.keys() & {*ORIGIN, *rows[0]})
     if clash:
         raise ValueError(f"labels must differ from the names of columns, got {clash[0]!r}")
-    origin = (study, dptse_env.__version__, cell.id)
-    head = dict(zip(ORIGIN, origin, strict=True)) | dict(cell.labels)
-    return pl.DataFrame([{**head, **row} for row in rows], infer_schema_length=None)
+    head = dict(zip(ORIGIN, (study, dptse_env.__version__, cell.id), strict=True))
+    rows = [{**head, **cell.labels, **row} for row in rows]
+    return pl.DataFrame(rows, infer_schema_length=None)
 
 
 def _file_of(folder: Path, cell_id: str) -> Path:
     return folder / f"{hashlib.sha256(cell_id.encode()).hexdigest()[:24]}.parquet"
-
-
-def _played(rows: pl.DataFrame) -> dict[str, set[int]]:
-    """Return the traffic seeds on which each cell was played."""
-    if rows.is_empty():
-        return {}
-    grouped = rows.group_by("cell").agg(pl.col("traffic_seed").unique())
-    return {cell: set(seeds) for cell, seeds in grouped.iter_rows()}
 
 
 def read_rows(study: str, folder: Path) -> pl.DataFrame:
@@ -204,19 +182,21 @@ def read_rows(study: str, folder: Path) -> pl.DataFrame:
     Raises:
         ValueError: A file is damaged, or of another study.
     """
-    files = [folder / ROWS, *sorted((folder / "rows").glob("*.parquet"))]
-    tables = [read_table(path, (*ORIGIN, "traffic_seed")) for path in files if path.exists()]
-    for path, table in zip((path for path in files if path.exists()), tables, strict=True):
-        others = [name for name in table["study"].unique() if name != study]
-        if others:
-            raise ValueError(
-                f"{path} has rows of the study {others[0]!r}, not of {study!r}: choose another "
-                "--output"
-            )
+    keys = (*ORIGIN, "traffic_seed")
+    tables = []
+    for path in (folder / ROWS, *sorted((folder / "rows").glob("*.parquet"))):
+        if path.exists():
+            tables.append(read_table(path, keys))
+            others = [name for name in tables[-1]["study"].unique() if name != study]
+            if others:
+                raise ValueError(
+                    f"{path} has rows of the study {others[0]!r}, not of {study!r}: choose another "
+                    "--output"
+                )
     if not tables:
-        return pl.DataFrame()
+        return pl.DataFrame(schema=keys)
     rows: pl.DataFrame = pl.concat(tables, how="diagonal_relaxed")
-    return rows.unique((*ORIGIN[1:], "traffic_seed"), keep="last", maintain_order=True)
+    return rows.unique(keys, keep="last", maintain_order=True)
 
 
 def read_table(path: Path, columns: Sequence[str] = ()) -> pl.DataFrame:

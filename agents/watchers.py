@@ -318,46 +318,35 @@ def near_since_start(
 
 
 class Summary:
-    """Honesty, refusals and queries of a batch of episodes, in a few columns.
+    """Honesty and refusals of a batch of episodes, in a few columns.
 
     Columns:
 
     - ``chi2_density``, ``chi2_speed``: as `Honesty` has them;
     - ``n_met``, ``n_refused``: as `Contributions` has them; None where the release model keeps no
-      account of vehicles;
-    - ``queries_a_second``: requests that were served.
+      account of vehicles.
     """
 
     def __init__(self, process: QueryProcess) -> None:
         """Prepare for the episodes of a process."""
-        self._process, self._honesty = process, Honesty(process)
+        self._honesty = Honesty(process)
         has_accounts = isinstance(process.release, Capped | Paced)
         self._contributions = Contributions(process) if has_accounts else None
-        self._queries, self._seconds = np.zeros(process.n_episodes), 0
 
     def __call__(self) -> None:
         """Follow the second that has passed."""
         self._honesty()
         if self._contributions is not None:
             self._contributions()
-        if self._process.elapsed[0] > 0:  # not at the call after the reset, before any query
-            self._queries += self._process.queried.sum(axis=1)
-            self._seconds += 1
 
     def rows(self) -> list[Row]:
         """See `dptse_env.evaluation.Watcher.rows`."""
-        counted: list[Row] = [{}] * len(self._queries)
+        names = ("chi2_density", "chi2_speed", "n_met", "n_refused")
+        rows = self._honesty.rows()
         if self._contributions is not None:
             counted = self._contributions.rows()
-        rows = zip(self._honesty.rows(), counted, self._queries, strict=True)
-        return [
-            {
-                **{name: chi2[name] for name in ("chi2_density", "chi2_speed")},
-                **{name: counts.get(name) for name in ("n_met", "n_refused")},
-                "queries_a_second": float(queries / self._seconds),
-            }
-            for chi2, counts, queries in rows
-        ]
+            rows = [{**one, **other} for one, other in zip(rows, counted, strict=True)]
+        return [{name: row.get(name) for name in names} for row in rows]
 
 
 WATCHERS: dict[str, WatcherFactory] = {

@@ -18,7 +18,7 @@ from pathlib import Path
 import polars as pl
 
 from agents.environments import make_config, parse_env
-from agents.figures import RoadMap, draw_maps, estimate_map, save_errors, save_figure
+from agents.figures import RoadMap, draw_errors, draw_maps, estimate_map, save_figure
 from agents.files import refuse_to_replace
 from agents.page import watch, write_page
 from agents.play import Cell
@@ -225,8 +225,15 @@ def main(args: Args) -> None:
 
     def report(rows: pl.DataFrame, folder: Path) -> str:
         scores = summarise(rows)
-        series = {name: {each.policy: each.means for each in own} for name, own in scores.items()}
-        save_errors(folder / ERRORS, list(next(iter(series.values()))), series, title)
+        series = {
+            name: {
+                each.policy: {error_label(metric): mean for metric, mean in each.means.items()}
+                for each in own
+            }
+            for name, own in scores.items()
+        }
+        rows_of_figure = list(next(iter(series.values())))
+        save_figure(draw_errors(rows_of_figure, series), folder / ERRORS, title)
         draw_traffic(args, title, scores, cells)
         return write_markdown(title, scores, args.reference)
 

@@ -16,17 +16,14 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from agents.environments import OTHER_DRIVERS
 from agents.figures import (
-    ESTIMATOR_LOOKS,
     LABELS,
     Look,
-    add_frame,
     draw_curve,
-    draw_dot,
+    draw_errors,
     draw_level,
     finish_figure,
     make_figure,
@@ -434,38 +431,21 @@ def sensed_tables(rows: pl.DataFrame) -> list[str]:
 
 # ---- Figures. ----
 
-LOOKS = {**ESTIMATOR_LOOKS, LEARNED: Look("#000000", "*")}
-
-
-def draw_dots(axis: Axes, intervals: Mapping[str, Interval], colours: Sequence[str]) -> None:
-    """Draw means with their intervals, from top to bottom."""
-    for place, (interval, colour) in enumerate(zip(intervals.values(), colours, strict=True)):
-        draw_dot(axis, interval, -place, colour, None)
-    axis.set_yticks([-place for place in range(len(intervals))], list(intervals))
-    axis.set_xlim(0.0, 1.15 * axis.get_xlim()[1])  # room for the numbers
-    add_frame(axis, "x")
-
 
 def draw_worlds(rows: pl.DataFrame) -> Figure:
     """Draw the error of every estimator in each main world."""
-    figure = make_figure(11.0, 3.4, dpi=100)
-    colours = [LOOKS[name].colour for name in EVERYONE]
-    for axis, world in zip(figure.subplots(1, len(MAIN), sharey=True), MAIN, strict=True):
-        errors = {LABELS[name]: mean(rows, in_world(world, name), ERROR) for name in EVERYONE}
-        draw_dots(axis, errors, colours)
-        axis.set_title(world, fontsize=9)
-        axis.set_xlabel("error x 1000", fontsize=8)
-    return figure
+    errors = {
+        LABELS[name]: {world: mean(rows, in_world(world, name), ERROR) for world in MAIN}
+        for name in EVERYONE
+    }
+    return draw_errors(list(errors), {"": errors})
 
 
 def draw_elsewhere(rows: pl.DataFrame) -> Figure:
     """Draw by how much the network's error lies below the EKF's away from the training."""
-    figure = make_figure(7.4, 5.0, dpi=100)
-    axis = figure.subplots()
-    gains = {world: below_ekf(rows, in_world(world)) for world in ELSEWHERE}
-    draw_dots(axis, gains, [LOOKS[LEARNED].colour] * len(gains))
-    axis.set_xlabel("error of the network below that of the EKF [%]", fontsize=8)
-    return figure
+    label = "error of the network below that of the EKF [%]"
+    gains = {world: {label: below_ekf(rows, in_world(world))} for world in ELSEWHERE}
+    return draw_errors(list(gains), {"": gains}, log=False)
 
 
 def draw_arms(rows: pl.DataFrame) -> Figure:
@@ -494,7 +474,7 @@ def draw_arms(rows: pl.DataFrame) -> Figure:
 
 
 FIGURES = {
-    "fig_estimators.png": (draw_worlds, "Error of the estimate under a round robin"),
+    "fig_estimators.png": (draw_worlds, "Error x 1000 of the estimate under a round robin"),
     "fig_elsewhere.png": (draw_elsewhere, "The recurrent network away from PrivateHighway-v1"),
     "fig_arms.png": (draw_arms, "Queries and detectors together, and either alone"),
 }

@@ -24,10 +24,10 @@ from agents.figures import (
     LABELS,
     Look,
     draw_curve,
+    draw_errors,
     draw_level,
     finish_figure,
     make_figure,
-    save_errors,
     save_figure,
     set_log_axes,
     set_log_ticks,
@@ -480,11 +480,13 @@ def draw_claimed(_: pl.DataFrame, path: Path) -> None:
 def draw_ladder(rows: pl.DataFrame, path: Path) -> None:
     """Draw the errors of every rung, from top to bottom."""
     rungs = {
-        label.replace("`", ""): {each: mean(rows, paid(**changes).labels, each) for each in METRICS}
+        label.replace("`", ""): {
+            error: mean(rows, paid(**changes).labels, metric) for metric, error in ERRORS.items()
+        }
         for label, changes, _ in LADDER
     }
     title = f"(ε, δ) = (5, {DELTA:g}) for a whole trip, replaced"
-    save_errors(path, list(rungs), {"": rungs}, title)
+    save_figure(draw_errors(list(rungs), {"": rungs}), path, title)
 
 
 def draw_budgets(rows: pl.DataFrame, path: Path) -> None:

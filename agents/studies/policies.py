@@ -31,7 +31,7 @@ from agents.figures import (
     LABELS,
     Look,
     draw_curve,
-    draw_dot,
+    draw_errors,
     finish_figure,
     make_figure,
     save_figure,
@@ -583,22 +583,17 @@ def joint_table(rows: pl.DataFrame) -> str:
 
 # Figures.
 
-KIND_COLOURS = {"rule": "#5f6b7a", "bound": COLOURS[4], "learned": COLOURS[0]}
-
 
 def draw_ladder(rows: pl.DataFrame, path: Path) -> None:
     """Draw the errors of all policies in the primary setting, a panel for each error."""
-    groups = [labels for _, labels in rank(rows, TEST, PRIMARY)]
-    figure = make_figure(10.4, 1.5 + 0.3 * len(groups), dpi=120)
-    axes = figure.subplots(1, len(METRICS), sharey=True)
-    for axis, (label, metric) in zip(axes, METRICS.items(), strict=True):
-        for place, labels in enumerate(groups):
-            kind, errors = labels["kind"], measure(rows, mean, labels, metric=metric)
-            draw_dot(axis, errors, -place, KIND_COLOURS[kind], kind)
-        axis.set_xlabel(label, fontsize=9)
-    axes[0].set_yticks(-np.arange(len(groups)), [name_of(labels) for labels in groups])
+    groups = {name_of(labels): labels for _, labels in rank(rows, TEST, PRIMARY)}
+    kinds: dict[str, dict[str, dict[str, Interval]]] = {}
+    for name, labels in groups.items():
+        kinds.setdefault(labels["kind"], {})[name] = {
+            label: measure(rows, mean, labels, metric=metric) for label, metric in METRICS.items()
+        }
     title = f"{SETTINGS[PRIMARY].description}; 95 % intervals"
-    save_figure(finish_figure(figure, margin=0.12), path, title)
+    save_figure(draw_errors(list(groups), kinds, log=False), path, title)
 
 
 def draw_queries(rows: pl.DataFrame, choice: Chosen, path: Path) -> None:

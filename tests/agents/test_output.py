@@ -9,7 +9,7 @@ from PIL import Image
 from rich.console import Console
 
 from agents import terminal
-from agents.figures import RoadMap, draw_maps, estimate_map, save_errors, save_figure
+from agents.figures import RoadMap, draw_errors, draw_maps, estimate_map, save_figure
 from agents.files import write_json
 from agents.page import watch, write_page
 from agents.play import Cell
@@ -95,7 +95,7 @@ def test_errors_of_every_policy_are_drawn(tmp_path):
     }  # fmt: skip
     rows = ["paper", "round-robin"]
     series = {name: dict.fromkeys(rows, pair) for name in ("ekf", "ukf")}
-    save_errors(tmp_path / "errors.png", rows, series, "title")
+    save_figure(draw_errors(rows, series), tmp_path / "errors.png", "title")
     with Image.open(tmp_path / "errors.png") as image:
         # Something is drawn: neither one colour nor the few of an empty frame.
         assert len(image.convert("RGB").getcolors(maxcolors=2**20)) > 100
