@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -128,6 +129,9 @@ def run(
     config = (tyro.conf.FlagCreatePairsOff,)
     try:
         main(tyro.cli(arguments, prog=program, args=words, description=description, config=config))
+    except BrokenPipeError:  # the reader of a pipe has seen enough, as head does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None
     except (*BAD_INPUT, *FAILURES) as problem:
         print(f"error: {_in_words(problem)}", file=sys.stderr)
         raise SystemExit(2 if isinstance(problem, BAD_INPUT) else 1) from problem
