@@ -351,7 +351,7 @@ def test_a_batch_equals_single_episodes_to_the_bit_in_any_order(name, backend, r
     assert_same(show(batch), show(shuffled))
     np.testing.assert_array_equal(batch.innovations[~episodes.observed[-1]], 0.0)
     for i, stream in enumerate(random_streams(3)):
-        one, row = make_estimator(name, backend, episodes.model, 1), slice(i, i + 1)
+        one, row = make_estimator(name, backend, episodes.model, 1, PLAIN), slice(i, i + 1)
         one.reset(np.arange(1), episodes.start[row], [stream])
         names = ("inputs", "observed", "values", "sigma", "centre")
         alone = {each: getattr(episodes, each) for each in names}
