@@ -29,8 +29,8 @@ def test_blocks_are_of_languages_that_are_tested_here_and_can_be_parsed():
         if block.language == "toml":
             assert tomllib.loads(block.text), block
         if block.language in ("bash", "sh"):
-            for line in block.text.replace("\\\n", " ").splitlines():
-                check(line.strip())
+            for line in commands(block.text):
+                check(line)
 
 
 @pytest.mark.parametrize("page", fast_and_slow(sorted(RUN), RUN - {"pictures.md"}))
@@ -42,6 +42,20 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatc
             if "RecordVideo" in block.text:
                 pytest.importorskip("moviepy", reason="the extra video is not installed")
             exec(compile(block.text, str(block), "exec"), names)
+
+
+def commands(text):
+    """Yield the command lines of a block; quotes may hold several lines."""
+    pending = ""
+    for line in text.replace("\\\n", " ").splitlines():
+        pending = f"{pending} {line.strip()}".strip()
+        try:
+            shlex.split(pending, comments=True)
+        except ValueError:  # a quote is open
+            continue
+        yield pending
+        pending = ""
+    assert not pending, pending
 
 
 def check(line):
