@@ -282,6 +282,7 @@ def test_an_unfit_policy_is_found_before_anything_is_recorded(tmp_path):
     assert list(tmp_path.iterdir()) == [policy]
 
 
+@pytest.mark.slow
 def test_a_cluster_that_does_not_answer_is_one_line(tmp_path, monkeypatch):
     words = ["evaluate", "--env", SHORT, "--output", tmp_path / "out"]
     assert "executor ray" in refused(*words, "--address", "auto")

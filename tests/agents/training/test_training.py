@@ -91,6 +91,7 @@ def test_a_training_that_is_killed_goes_on_to_the_same_bits(update, more, whole,
     assert_alike(tmp_path / "killed", whole(**changes)[0])
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_a_folder_to_go_on_in(whole, tmp_path, monkeypatch):
     replace, written = Path.replace, []
 
