@@ -39,9 +39,11 @@ def measure(*, quick: bool = False) -> list[Line]:
         work = {"libsumo alone": simulating(), "recording": recording(Path(folder))}
         if importlib.util.find_spec("sumo_rl"):
             work["sumo-rl, one intersection"] = intersection(quick)
-        work["one episode"] = alone(50, keywords)
+        work["one episode"] = alone(8 if quick else 400, keywords)
         for mode in ("sync", "async"):
-            work[f"{mode} vectorisation, 8 episodes"] = gymnasium_vector(mode, 8, 25, keywords)
+            work[f"{mode} vectorisation, 8 episodes"] = gymnasium_vector(
+                mode, 8, 4 if quick else 100, keywords
+            )
         for size in (64, n):
             batch = make_batch(PAPER, size, **keywords)
             work[f"batch of {size:,}"] = stepping(batch, steps * (4 if size < n else 1))
