@@ -71,7 +71,7 @@ class Machines(Recording):
     """Machines that run tasks. Results do not depend on them."""
 
     executor: ExecutorName = "local"
-    """Where tasks run: on this machine, or on a Ray cluster."""
+    """Place of the tasks: this machine, or a Ray cluster."""
     address: str | None = None
     """Address of the Ray cluster, or auto; see RAY_ADDRESS, too."""
 

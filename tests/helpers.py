@@ -1,4 +1,4 @@
-"""What tests of several folders share: chosen cases, environments, roads, records and policies."""
+"""Helpers of tests in several folders: chosen cases, environments, roads, records and policies."""
 
 from __future__ import annotations
 
@@ -329,7 +329,7 @@ ABOUT = {
     "training": {"learner": "plackett-luce", "seed": 0, "steps": 100},
     "figures": {"error": 0.1234567890123},
 }
-"""What the card of a saved policy tells of its training."""
+"""Training as the card of a saved policy tells of it."""
 
 
 def untrained(action="slots", preset="short-highway", net_arch=None, seed=0, **keywords):

@@ -59,7 +59,7 @@ class Episodes:
 
     @property
     def road(self) -> list[object]:
-        """What the episodes of a batch have in common."""
+        """Values that the episodes of a batch have in common."""
         return [getattr(self.corridor, name) for name in _SAME]
 
     def pick(self, chosen: AnyArray) -> Episodes:

@@ -37,7 +37,7 @@ Watcher = Callable[[Row], None]
 
 
 class State(NamedTuple):
-    """What is known after a second of k episodes."""
+    """The state of k episodes after a second."""
 
     hidden: Tensor  # (k, S, H)
     predicted: FloatArray  # of the next second, with deviations, (k, S, 4)

@@ -64,7 +64,7 @@ BATCH = 8
 
 @dataclass(frozen=True)
 class Search:
-    """What one set of settings is tuned for.
+    """The search for one set of settings.
 
     Attributes:
         env: The environment, an id or an id and keywords as JSON (`agents.environments.parse_env`).

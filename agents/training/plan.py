@@ -1,4 +1,4 @@
-"""What a training depends on: algorithms with their settings, environments, seeds.
+"""The plan of a training: algorithms with their settings, environments, seeds.
 
 An algorithm is a frozen dataclass of settings here, an entry in `ALGORITHMS`, and the function that
 trains by it, an entry in `agents.training.training.TRAINERS`.

@@ -23,7 +23,7 @@ COLUMNS = (
     "validation", "validation_drawn", "learning_rate", "approx_kl", "clip_fraction",
     "entropy_loss", "explained_variance", "value_loss",
 )  # fmt: skip
-"""What of the log of stable-baselines3 is in the curve, beside the error."""
+"""Columns of the curve that come from the log of stable-baselines3, beside the error."""
 
 
 def train_by_ppo(run: Run) -> None:

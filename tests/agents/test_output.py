@@ -1,4 +1,4 @@
-"""What tools write for people: tables at a terminal, JSON, figures, and a page."""
+"""Output for people: tables at a terminal, JSON, figures, and a page."""
 
 import sys
 

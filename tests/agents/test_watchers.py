@@ -1,4 +1,4 @@
-"""What watchers count of episodes, against truth, records and numbers made up by hand."""
+"""Watchers of episodes, against truth, records and numbers made up by hand."""
 
 from types import SimpleNamespace
 

@@ -27,7 +27,7 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 EVERY = [(name, "compiled") for name in ESTIMATORS] + [(name, "reference") for name in REFERENCES]
 RELEASES = ("speed", "flow", "rows")
-"""What sensors release beside the density: the mean speed, or the flow rho (v - v_0); or flows and
+"""Release of sensors beside the density: the mean speed, or the flow rho (v - v_0); or flows and
 densities of rows of several segments, each with noise and speeds v_0 of its own."""
 FIELDS = ("density", "speed", "density_std", "speed_std")
 REFERENCE_SPEED = 51.0
@@ -55,7 +55,7 @@ class Episodes:
         return np.arange(len(self.start))
 
     def released(self, k: int, which: Any) -> dict[str, Any]:
-        """What is released of episodes in a step, as arguments of `Measurement.of`."""
+        """The release of a step of episodes, as arguments of `Measurement.of`."""
         names = ("observed", "values", "sigma", *(() if self.centre is None else ("centre",)))
         return {name: getattr(self, name)[k, which] for name in names}
 

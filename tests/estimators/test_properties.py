@@ -339,7 +339,7 @@ def test_rows_that_nobody_measures_change_nothing(name, backend, release):
 
 @over()
 def test_a_batch_equals_single_episodes_to_the_bit_in_any_order(name, backend, release):
-    """Whatever the values of unobserved rows are."""
+    """The values of unobserved rows do not matter."""
     n_steps = steps_of(name, backend, 40)
     episodes = simulate(n=3, n_steps=n_steps, noise=2.0, release=release)
     hidden = np.where(episodes.observed[..., None], episodes.values, np.nan)

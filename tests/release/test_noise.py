@@ -52,7 +52,7 @@ FAULTS = {
     f"correlation: lag {BLOCK}": lambda block: np.random.default_rng(1).normal(size=block.shape),
     None: lambda block: block,
 }
-"""What a wrong `Noise` makes of each block that it draws, by the symptom."""
+"""Blocks as a wrong `Noise` draws them, by the symptom."""
 
 
 @pytest.mark.parametrize("symptom", FAULTS)

@@ -433,7 +433,7 @@ MUTANTS = {
         REPLACE, {}, STANDS, stays(3, 0.0), 1.9,
     ),
 }  # fmt: skip
-"""What ledgers get wrong, worlds that show it, and the part of mu^2 that they reach at least."""
+"""Mistakes of ledgers, worlds that show them, and the part of mu^2 that they reach at least."""
 
 
 @pytest.mark.parametrize(

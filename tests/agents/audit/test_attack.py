@@ -1,4 +1,4 @@
-"""What the adversary hears, how he scores it, and what he finds."""
+"""The attack: releases as the adversary hears them, his scores, and his findings."""
 
 import dataclasses
 import math
