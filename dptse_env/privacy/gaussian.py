@@ -79,8 +79,8 @@ def epsilon_of(mu: float, delta: float) -> float:
 def mu_of(epsilon: float, delta: float) -> float:
     """Largest parameter mu of a release that is (epsilon, delta)-private.
 
-    The inverse of `delta_of` in its first argument, with a relative error below 2e-12 for an epsilon
-    in [1e-4, 1e4] and a delta of 1e-12 or more.
+    The inverse of `delta_of` in its first argument. Its relative error is below 2e-12 where epsilon
+    lies in [1e-4, 1e4] and delta is at least 1e-12.
     """
     epsilon, delta = positive("epsilon", epsilon), _checked_delta(delta)
     log_delta = math.log(delta)
