@@ -178,10 +178,15 @@ MUTANTS = (
         "release/test_vehicles.py",
     ),
     Mutant(
+        "a sum is no multiple of the grid", 5, "release/vehicles.py",
+        "sums[k, c, 1] = deviations[c] * grid[c]", "sums[k, c, 1] = deviations[c] * 1.01 * grid[c]",
+        "release/test_vehicles.py",
+    ),
+    Mutant(
         "a deviation is charged before it is rounded", 6, "release/vehicles.py",
         "d = steps * grid[c]",
         "d = min(max(min(reported, fastest) - centre[k, s], -clip), clip)",
-        "release/test_paced.py",
+        "release/test_vehicles.py",
     ),
     Mutant(
         "a deviation at the clip is rounded up", 6, "release/vehicles.py",
@@ -237,6 +242,11 @@ MUTANTS = (
         "release/test_paced.py",
     ),
     Mutant(
+        "vehicles that are not connected report", 9, "traffic/penetration.py",
+        "return np.where(reports, speeds, np.float32(-1.0))", "return speeds",
+        "traffic/test_penetration.py",
+    ),
+    Mutant(
         "a ledger goes with the segment", 10, "release/vehicles.py",
         "s, v = place[row], vehicle[row]",
         "s, v = place[row], (vehicle[row] + place[row]) % paid.shape[2]",
@@ -280,6 +290,11 @@ MUTANTS = (
         "release/test_paced.py",
     ),
     Mutant(
+        "released boundary segments are not charged", 11, "release/vehicles.py",
+        "ledgers[g, v] += cost", "ledgers[g, v] += cost if s < n_places - 4 else 0.0",
+        "release/test_vehicles.py",
+    ),
+    Mutant(
         "a vehicle counts once more than the cap", 12, "release/gaussian.py",
         "math.inf if cap is None else float(cap)", "math.inf if cap is None else cap + 1.0",
         "release/test_gaussian.py",
@@ -312,6 +327,11 @@ MUTANTS = (
         "release/test_paced.py",
     ),
     Mutant(
+        "a capped second depends on how often a vehicle counted before", 13, "release/gaussian.py",
+        'return self.cap if self.unit == "trip" else None', "return self.cap",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
         "overlapping queries of a second do not divide its budget", 13, "release/pacing.py",
         "most = max(most, total[g, s] + own)", "most = max(most, own)",
         "release/test_pacing.py",
@@ -336,6 +356,17 @@ MUTANTS = (
         "sensors have the noise of queries", 14, "release/gaussian.py",
         "self.noise_std[task.group]", "self.noise_std[0 * task.group]",
         "release/test_gaussian.py",
+    ),
+    Mutant(
+        "the report of caps has the mu of one group", 14, "release/gaussian.py",
+        "math.hypot(*self.mu), task.settings.delta", "max(self.mu), task.settings.delta",
+        "release/test_sensors.py",
+    ),
+    Mutant(
+        "the report of ledgers has the mu of one group", 14, "release/paced.py",
+        "EpsilonTable(math.hypot(*self.mu), settings.delta)",
+        "EpsilonTable(max(self.mu), settings.delta)",
+        "release/test_sensors.py",
     ),
     # --- noise --------------------------------------------------------------------------------
     Mutant(
@@ -475,6 +506,11 @@ MUTANTS = (
         'against = "" if self.noise == "secure" else', 'against = "" if self.noise else',
         "release/test_paced.py",
     ),
+    Mutant(
+        "a model whose noise is its own says that it is secure", 18, "release/base.py",
+        'has_noise = self.settings.noise == "seeded" or', "has_noise = True or",
+        "test_streams.py",
+    ),
     # --- from distances to the guarantee ------------------------------------------------------
     Mutant(
         "the estimator reads a second before the centres are taken", 19, "process.py",
@@ -531,6 +567,28 @@ MUTANTS = (
         "mu is that of a single one-sided bound", 21, "privacy/gaussian.py",
         "return float(log_ndtr(upper)) + math.log1p(-lower_over_upper)",
         "return float(log_ndtr(upper)) + 2.0 * math.log1p(-lower_over_upper)",
+        "privacy/test_gaussian.py",
+    ),
+    Mutant(
+        "mu is a little too large", 21, "privacy/gaussian.py",
+        "return float(brentq(excess, low, high, xtol=1e-16 * low",
+        "return (1.0 + 1e-11) * float(brentq(excess, low, high, xtol=1e-16 * low",
+        "privacy/test_gaussian.py",
+    ),
+    Mutant(
+        "epsilon is given for another delta than is named", 21, "privacy/gaussian.py",
+        "{name: epsilon_of(mu, float(name)) for name in DELTAS}",
+        "{name: epsilon_of(mu, 0.05) for name in DELTAS}",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "a guarantee states mu rounded down", 21, "release/base.py",
+        "math.ceil(1e4 * mu)", "math.floor(1e4 * mu)",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "the reserve is smaller than the rounding of ledgers", 22, "privacy/gaussian.py",
+        "ROUNDING = 2.0**-30", "ROUNDING = 2.0**-36",
         "privacy/test_gaussian.py",
     ),
     Mutant(
@@ -600,6 +658,11 @@ MUTANTS = (
         "paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price",
         "paid[accounts.group[c], s] += price",
         "release/test_paced.py",
+    ),
+    Mutant(
+        "what is spent grows with the number of contributions", 24, "privacy/gaussian.py",
+        "self.mu * np.sqrt(np.arange(n + 1) / n)", "self.mu * (np.arange(n + 1) / n)",
+        "privacy/test_gaussian.py",
     ),
     Mutant(
         "epsilon is rounded down to a level of mu", 24, "privacy/gaussian.py",

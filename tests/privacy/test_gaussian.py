@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dptse_env.privacy import (
+    ROUNDING,
     EpsilonTable,
     ReleaseAccount,
     contribution_sensitivity,
@@ -21,6 +22,7 @@ from dptse_env.privacy import (
     mu_of,
     paper_sensitivity,
     printed_noise_std,
+    require_covered,
     single_noise_std,
 )
 
@@ -103,6 +105,14 @@ def test_mu_is_exact_to_twice_ten_to_the_minus_twelve_wherever_a_guarantee_may_b
         slope = mpmath.npdf(mpmath.mpf(mu) / 2 - mpmath.mpf(epsilon) / mu)
         assert abs(excess / slope / mu) < 2e-12
     assert 1.0 / mu == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-11)
+
+
+def test_no_more_payments_are_allowed_than_the_reserve_covers():
+    """Each is off by 2^-53 of the budget, deviations of the noise by 2^-49, mu by 2e-12."""
+    too_many = (ROUNDING - 2.0**-49 - 2.0 * 2e-12) * 2.0**53
+    require_covered(2**22)
+    with pytest.raises(ValueError, match=r"^horizon must be shorter: .* 4194304 times"):
+        require_covered(int(too_many))
 
 
 @settings(deadline=None)
