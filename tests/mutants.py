@@ -196,7 +196,7 @@ MUTANTS = (
     Mutant(
         "deviations are charged unclipped and released clipped", 6, "release/vehicles.py",
         "d = steps * grid[c]", "d = min(reported, fastest) - centre[k, s]",
-        "release/test_paced.py",
+        "release/test_vehicles.py",
     ),
     Mutant(
         "deviations are charged clipped and released unclipped", 6, "release/vehicles.py",
