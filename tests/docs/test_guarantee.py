@@ -36,15 +36,24 @@ def test_the_guarantee_has_the_epsilons_of_its_mus():
 
 @pytest.mark.parametrize("line", TITLE.split(PROOF)[2::2], ids=TITLE.findall(PROOF))
 def test_a_line_of_the_proof_names_code_and_tests_that_exist(line):
-    line = line.split("\n## ")[0]
-    code = re.findall(r"`(dptse_env/[\w/]+)\.py:([\w.]+)`", line)
-    tests = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", line)
-    assert code
-    assert tests
-    for path, name in code:
-        attrgetter(name)(importlib.import_module(path.replace("/", ".")))
-    for path, name in tests:
-        assert f"\ndef {name}(" in (ROOT / path).read_text(encoding="utf-8")
+    (code,), (tests,) = (
+        re.findall(rf"^- {kind}: (.*?)$\n(?! )", line, re.MULTILINE | re.DOTALL)
+        for kind in ("Code", "Test")
+    )
+    for path, names in named(code):
+        module = importlib.import_module(path.removesuffix(".py").replace("/", "."))
+        for name in names:
+            attrgetter(name)(module)
+    for path, names in named(tests):
+        text = (ROOT / path).read_text(encoding="utf-8")
+        assert all(f"\ndef {name}(" in text for name in names)
+
+
+def named(text):
+    """Return pairs of a file and what is named after it; there is one pair at least."""
+    pairs = re.findall(r"`([\w/]+\.py)`:\s+((?:`[\w.]+`,?\s*)+)", text)
+    assert pairs
+    return [(path, re.findall(r"`([\w.]+)`", names)) for path, names in pairs]
 
 
 def test_lines_of_the_proof_are_numbered():
