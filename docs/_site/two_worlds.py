@@ -46,7 +46,7 @@ class Transcript(NamedTuple):
 
 
 def play(config: EnvConfig, worlds: AdjacentWorlds) -> Transcript:
-    """Play world 0 under a round robin, and keep the ledgers by the rule of `Paced`."""
+    """Play world 0 under a round robin, and keep the ledgers as `Paced` does, but for its rounding."""
     T, clip, ratio = config.horizon_steps, config.privacy.clip, config.privacy.ratio
     mu = privacy_report(config).mu
     found = Transcript(*(np.full(shape, np.nan) for shape in ((2, T), (2, T), T, T)))
@@ -103,7 +103,7 @@ def draw(config: EnvConfig, worlds: AdjacentWorlds, found: Transcript) -> Figure
     ledger.axhline(100.0, color="black", lw=0.8)
     ledger.set_ylim(0, 112)
     ledger.set_ylabel("%", fontsize=9)
-    add_title(ledger, "Ledger: paid, of the budget")
+    add_title(ledger, "Ledger: part of the budget that is paid")
     say(ledger, (190, 90), "trip of world 0", COLOURS[0])
     say(ledger, (357, 45), "trip of\nworld 1", COLOURS[1])
     say(ledger, (330, 10), "dotted: squared\ndistance of the sums,\nof mu squared", "black")
