@@ -46,7 +46,7 @@ class Transcript(NamedTuple):
 
 
 def play(config: EnvConfig, worlds: AdjacentWorlds) -> Transcript:
-    """Play world 0 under a round robin, and keep the ledgers as `Paced` does, but for its rounding."""
+    """Play world 0 under a round robin; keep ledgers as `Paced` does, but for its rounding."""
     T, clip, ratio = config.horizon_steps, config.privacy.clip, config.privacy.ratio
     mu = privacy_report(config).mu
     found = Transcript(*(np.full(shape, np.nan) for shape in ((2, T), (2, T), T, T)))
