@@ -156,7 +156,6 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | id                  | n   | S   | record | release, epsilon | bandwidth | demand, incident |
     | :--                 | :-- | :-- | :--    | :--              | :--       | :--              |
     | `PaperHighway-v0`   | 15  | 19  | 700 s  | paper, 1         | 5         | fixed            |
-    | `PrivateHighway-v0` | 15  | 19  | 700 s  | capped, 5        | 5         | random           |
     | `PrivateHighway-v1` | 15  | 19  | 700 s  | paced, 5         | 5         | random           |
     | `LongHighway-v0`    | 120 | 128 | 1200 s | paced, 5         | 8         | random           |
     | `ShortHighway-v0`   | 6   | 8   | 240 s  | paper, 1         | 2         | fixed            |

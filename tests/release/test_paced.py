@@ -272,7 +272,7 @@ def test_where_queries_overlap_the_account_adds_what_a_vehicle_pays_for_all_of_t
 @pytest.mark.parametrize(("unit", "adjacency"), [("trip", "replace"), ("event", "add_remove")])
 def test_the_report_says_what_is_guaranteed(unit, adjacency):
     privacy = {"unit": unit, "adjacency": adjacency, "pace": 0.7, "clip": 25.0}
-    found = privacy_report(resolve("private-highway-v1", {"privacy": privacy}))
+    found = privacy_report(resolve("private-highway", {"privacy": privacy}))
     mu = mu_of(5.0, 0.05)
     assert ("whole trip" in found.protects) == (unit == "trip")
     assert found.protects.endswith("or by none" if adjacency == "replace" else "removed")
