@@ -238,7 +238,7 @@ class Paced(ReleaseModel):
 
     def _losses(self, paid: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mu and epsilon of vehicles that have paid at most (vehicles, groups)."""
-        squares = np.minimum(self._squares * paid, self._whole)
+        squares = np.minimum((1.0 + ROUNDING) * self._squares * paid, self._whole)
         return self._epsilons.bounds(np.sqrt(squares.sum(axis=1)))
 
     def report(self) -> PrivacyReport:
