@@ -169,13 +169,13 @@ def observations(name: str) -> Numbers:
     env = _make(name)
     schedule = make_schedule("paper", env)
     observation, info = env.reset(seed=11)
-    rows, rewards, spent, state = [observation], [], [info["mu"]], None
+    rows, rewards, spent, state = [observation], [], [info["spent_mu"]], None
     for _ in range(SECONDS):
         action, state = schedule.predict(observation, state, np.array([state is None]), True)
         observation, reward, _, _, info = env.step(action)
         rows.append(observation)
         rewards.append(reward)
-        spent.append(info["mu"])
+        spent.append(info["spent_mu"])
     kept = {"observations": _projected(rows), "rewards": rewards, "mu": spent}
     return {key: np.array(value, dtype=np.float32) for key, value in kept.items()}
 
@@ -222,7 +222,7 @@ def releases(case: str) -> Numbers:
         action = np.zeros(n_options, dtype=np.int8)
         action[rng.choice(n_options, min(2, n_queries), replace=False)] = 1
         *_, info = env.step(action)
-        spent.append(info["mu"])
+        spent.append(info["spent_mu"])
     return {
         "values": _projected(values),
         "sigma": _projected(sigma),

@@ -42,7 +42,7 @@ SUMS = "tests.helpers:SumRelease"
 PRIVACY = {
     "preset": "capped", "epsilon": 2, "delta": 0.01, "unit": "horizon", "cap": 8,
     "adjacency": "add_remove", "share": 0.25, "speed_release": "flow",
-    "boundary_inputs": "private",
+    "boundary_inputs": "private", "noise": "secure",
 }  # fmt: skip
 WHOLE = [
     {"incident": "random", "demand": "random"},

@@ -244,7 +244,7 @@ def tell_realised_exposures(process):
 
     def mutant(episode):
         paid = process.release.ledgers.paid[episode]
-        return info(episode) | {"mu": float(paid.max(initial=0))}
+        return info(episode) | {"spent_mu": float(paid.max(initial=0))}
 
     process.info = mutant
 

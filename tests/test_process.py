@@ -111,7 +111,7 @@ def test_residuals_are_the_noise_that_is_declared():
 
     def spy(episodes, values, sigma, unit):
         released = added(episodes, values, sigma, unit)
-        residuals.append((released - values)[0] / process.release.sigma)
+        residuals.append((released - values / unit[:, None])[0] / process.release.sigma)
         return released
 
     process.release.noise.added = spy
