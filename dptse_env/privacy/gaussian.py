@@ -200,7 +200,7 @@ class EpsilonTable:
     def bounds(self, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mu, held to the largest, and epsilon, rounded up to one of 256 levels of mu."""
         mu = np.minimum(mu, self.mu)
-        level = np.ceil(mu / self.mu * N_LEVELS * (1.0 - 1e-12)).astype(np.int64)
+        level = np.ceil(mu / self.mu * N_LEVELS).astype(np.int64)
         return mu, self._epsilons[level]
 
 

@@ -104,7 +104,8 @@ def test_mu_is_exact_to_twice_ten_to_the_minus_twelve_wherever_a_guarantee_may_b
         excess = exact_delta(mu, epsilon) - mpmath.mpf(delta)
         slope = mpmath.npdf(mpmath.mpf(mu) / 2 - mpmath.mpf(epsilon) / mu)
         assert abs(excess / slope / mu) < 2e-12
-    assert 1.0 / mu == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-11)
+    # That of dp-accounting has an error of its own, where epsilon is small.
+    assert 1.0 / mu == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-10)
 
 
 def test_no_more_payments_are_allowed_than_the_reserve_covers():

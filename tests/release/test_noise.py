@@ -86,7 +86,7 @@ def test_normal_numbers_are_within_a_thousandth_of_the_doubt_that_is_allowed(siz
         v = int(mpmath.erfc(size / mpmath.sqrt(2)) * 2**63)
         for tail in (v, v + 1, v + 12345):
             exact = -mpmath.sqrt(2) * mpmath.erfinv(1 - mpmath.mpf(2 * tail + 1) / 2**64)
-            below, above = normal_of(np.array([2 * tail, 2 * tail + 1], dtype=np.uint64)).tolist()
+            above, below = normal_of(np.array([2 * tail, 2 * tail + 1], dtype=np.uint64)).tolist()
             assert below == -above
             assert abs(float(below - exact)) < DOUBT * (1.0 + size) / 1000.0
 
@@ -106,7 +106,7 @@ def test_bits_at_the_border_between_two_integers_are_settled_by_more_of_them(sca
         tail, rest = int(mpmath.floor(at)), int(mpmath.floor((at - mpmath.floor(at)) * 2**64))
     for first, expected in ((rest + 2, border), (max(rest - 2, 0), border + 1)):
         further = iter([first, 0])
-        found = rounded_normal(scale, 2 * tail, lambda further=further: next(further))
+        found = rounded_normal(scale, 2 * tail + 1, lambda further=further: next(further))
         low, high = interval(scale, found)
         with mpmath.workdps(60):
             value = (mpmath.mpf(tail) + mpmath.mpf(first) / 2**64) / 2**64
