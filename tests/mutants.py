@@ -148,13 +148,13 @@ MUTANTS = (
     Mutant(
         "two vehicles share a ledger", 4, "release/vehicles.py",
         "s, v = place[row], vehicle[row]", "s, v = place[row], vehicle[row] // 2",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a segment answers for three vehicles at most", 4, "release/vehicles.py",
         "if ledgers[g, v] + cost <= budget[g]:",
         "if ledgers[g, v] + cost <= budget[g] and counts[c] < 3:",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the grid of deviations is coarser than one km/h", 5, "release/noise.py",
@@ -186,39 +186,39 @@ MUTANTS = (
         "a deviation is charged before it is rounded", 6, "release/vehicles.py",
         "d = steps * grid[c]",
         "d = min(max(min(reported, fastest) - centre[k, s], -clip), clip)",
-        "release/test_vehicles.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a deviation at the clip is rounded up", 6, "release/vehicles.py",
         "most = np.floor(clip / grid[c])", "most = np.ceil(clip / grid[c])",
-        "release/test_vehicles.py release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "deviations are charged unclipped and released clipped", 6, "release/vehicles.py",
         "d = steps * grid[c]", "d = min(reported, fastest) - centre[k, s]",
-        "release/test_vehicles.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "deviations are charged clipped and released unclipped", 6, "release/vehicles.py",
         "deviations[c] += np.int64(steps)",
         "deviations[c] += np.int64((min(reported, fastest) - centre[k, s]) / grid[c])",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a vehicle is charged for being counted alone", 6, "release/vehicles.py",
         "prices[k, c] * (1.0 + ratio * d * d / (clip * clip))", "prices[k, c]",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the noise of deviations does not follow the ratio", 6, "release/paced.py",
         "self._flow_noise = settings.clip / math.sqrt(settings.ratio)",
         "self._flow_noise = settings.clip",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "overlaps are charged once", 7, "release/vehicles.py",
         "ledgers[g, v] += cost", "ledgers[g, v] += cost if i == 0 else 0.0",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a ratio of two is allowed under replace", 8, "release/paced.py",
@@ -228,18 +228,18 @@ MUTANTS = (
     Mutant(
         "the budget is not halved under replace", 8, "release/paced.py",
         'self._squares = 2.0 if settings.adjacency == "replace" else 1.0', "self._squares = 1.0",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "budgets of replace and of add_remove are exchanged", 9, "release/paced.py",
         'self._squares = 2.0 if settings.adjacency == "replace" else 1.0',
         'self._squares = 1.0 if settings.adjacency == "replace" else 2.0',
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "vehicles that are not connected are counted", 9, "release/vehicles.py",
         "if reported < 0.0:", "if reported < -1.0:",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "vehicles that are not connected report", 9, "traffic/penetration.py",
@@ -250,12 +250,12 @@ MUTANTS = (
         "a ledger goes with the segment", 10, "release/vehicles.py",
         "s, v = place[row], vehicle[row]",
         "s, v = place[row], (vehicle[row] + place[row]) % paid.shape[2]",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "ledgers are kept over a reset", 10, "release/vehicles.py",
         "self.paid[episodes] = 0.0", "self.paid = self.paid.copy()",
-        "release/test_vehicles.py release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a paced reset clears the ledgers of its first episode alone", 10, "release/paced.py",
@@ -277,43 +277,43 @@ MUTANTS = (
     Mutant(
         "a trip has a budget for every second", 10, "release/paced.py",
         'if self.task.settings.unit == "event":  # every', "if True:  # every",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the last payment overdraws the ledger", 11, "release/vehicles.py",
         "if ledgers[g, v] + cost <= budget[g]:", "if ledgers[g, v] <= budget[g]:",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a refused contribution is added", 11, "release/vehicles.py",
         "refused[k, g] += 1", "refused[k, g] += 1; counts[c] += 1",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "released boundary segments are not charged", 11, "release/vehicles.py",
         "ledgers[g, v] += cost", "ledgers[g, v] += cost if s < n_places - 4 else 0.0",
-        "release/test_vehicles.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a vehicle counts once more than the cap", 12, "release/gaussian.py",
         "math.inf if cap is None else float(cap)", "math.inf if cap is None else cap + 1.0",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "flows are not centred on the middle of the speeds", 12, "release/gaussian.py",
         "return 0.5 * corridor.largest_speed_limit if",
         "return 0.4 * corridor.largest_speed_limit if",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "speeds are not clipped to the limit", 12, "release/gaussian.py",
         "fastest = task.corridor.largest_speed_limit", "fastest = math.inf",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "two speeds on one segment are taken for speeds on two", 12, "privacy/sensitivity.py",
         "same_segment = 2.0 * flow", "same_segment = math.sqrt(2.0) * flow",
-        "privacy/test_sensitivity.py release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the noise is that of the longest segment", 12, "release/gaussian.py",
@@ -324,12 +324,12 @@ MUTANTS = (
     Mutant(
         "the ledger of a second is not cleared", 13, "release/paced.py",
         'if self.task.settings.unit == "event":  # every', "if False:  # every",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a capped second depends on how often a vehicle counted before", 13, "release/gaussian.py",
         'return self.cap if self.unit == "trip" else None', "return self.cap",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "overlapping queries of a second do not divide its budget", 13, "release/pacing.py",
@@ -339,34 +339,34 @@ MUTANTS = (
     Mutant(
         "a trip without a cap has the noise of one that is capped", 13, "release/gaussian.py",
         '"horizon": horizon, "event": 1}', '"horizon": self.cap, "event": 1}',
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "each group of a paced release has the whole budget", 14, "release/paced.py",
         "mu_of(settings.epsilon, settings.delta) * np.sqrt(task.shares)",
         "mu_of(settings.epsilon, settings.delta) * np.ones_like(task.shares)",
-        "release/test_sensors.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "queries have the whole budget beside the sensors' part", 14, "release/sensors.py",
         'Group("queries", 1.0 - share, penetration)', 'Group("queries", 1.0, penetration)',
-        "release/test_sensors.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "sensors have the noise of queries", 14, "release/gaussian.py",
         "self.noise_std[task.group]", "self.noise_std[0 * task.group]",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the report of caps has the mu of one group", 14, "release/gaussian.py",
         "math.hypot(*self.mu), task.settings.delta", "max(self.mu), task.settings.delta",
-        "release/test_sensors.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the report of ledgers has the mu of one group", 14, "release/paced.py",
         "EpsilonTable(math.hypot(*self.mu), settings.delta)",
         "EpsilonTable(max(self.mu), settings.delta)",
-        "release/test_sensors.py",
+        "test_guarantee.py",
     ),
     # --- noise --------------------------------------------------------------------------------
     Mutant(
@@ -594,12 +594,12 @@ MUTANTS = (
     Mutant(
         "ledgers keep nothing back for rounding", 22, "release/paced.py",
         "(1.0 - ROUNDING) * self.budget", "self.budget",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "capped noise keeps nothing back for rounding", 22, "release/gaussian.py",
         "factor = (1.0 + ROUNDING) / math.sqrt", "factor = 1.0 / math.sqrt",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "an episode may have more payments than the reserve covers", 22, "release/paced.py",
@@ -641,23 +641,23 @@ MUTANTS = (
         "what is spent leaves out queries that overlap", 24, "release/paced.py",
         "paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price",
         "paid[accounts.group[c], s] = (1.0 + accounts.ratio) * price",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "what is spent is the largest of a group", 24, "release/paced.py",
         "np.sqrt(squares.sum(axis=1))", "np.sqrt(squares.max(axis=1))",
-        "release/test_sensors.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "what is spent is the largest of a second", 24, "release/paced.py",
         "if accounts.is_event else charged[g] + largest", "",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "what is spent is a vehicle's payment at the predicted speed", 24, "release/paced.py",
         "paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price",
         "paid[accounts.group[c], s] += price",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "what is spent grows with the number of contributions", 24, "privacy/gaussian.py",
