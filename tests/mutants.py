@@ -85,6 +85,20 @@ MUTANTS = (
         "test_non_interference.py",
     ),
     Mutant(
+        "the estimator reads no answer of an empty segment", 2, "process.py",
+        "measured = self.measure(request)",
+        "measured = self.measure(request); "
+        "measured.observed[:, :15] &= self.truth(episodes)[:, :15, 0] > 0.0",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "an empty segment has a release of zero", 2, "process.py",
+        "measured = self.release.release(request)",
+        "measured = self.release.release(request); "
+        "measured.values[:, :15] *= self.truth(request.episodes)[:, :15, :1] > 0.0",
+        "test_non_interference.py",
+    ),
+    Mutant(
         "ledgers are in info", 2, "process.py",
         "**self.release.public(episodes),",
         "**self.release.public(episodes), **self.release.private(episodes, 0 * episodes),",
@@ -117,6 +131,13 @@ MUTANTS = (
         "predicted, centre = self._predicted(request); "
         "centre[:, : self._limits.size] = "
         "self.traffic.aggregates(request.traffic, request.times)[..., 1]",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "empty segments count as those without a prediction", 3, "release/paced.py",
+        "predicted, centre = self._predicted(request)",
+        "predicted, centre = self._predicted(request); self._fallback[request.episodes] = "
+        "(self.traffic.aggregates(request.traffic, request.times)[..., 0] == 0.0).sum(axis=1)",
         "test_non_interference.py",
     ),
     Mutant(
@@ -554,6 +575,14 @@ MUTANTS = (
         "release/test_fusion.py",
     ),
     Mutant(
+        "answers are divided by the true share", 20, "process.py",
+        "measured = self.fusion.read(measured, request.prediction())",
+        "self.fusion.share = self.config.penetration.share_of("
+        "self.config.traffic_seeds[request.traffic[0]]); "
+        "measured = self.fusion.read(measured, request.prediction())",
+        "test_non_interference.py",
+    ),
+    Mutant(
         "density and flow have the noise that each needs alone", 21, "privacy/gaussian.py",
         "shares = share, 1.0 - share", "shares = 1.0, 1.0",
         "privacy/test_gaussian.py",
@@ -663,6 +692,12 @@ MUTANTS = (
         "what is spent grows with the number of contributions", 24, "privacy/gaussian.py",
         "self.mu * np.sqrt(np.arange(n + 1) / n)", "self.mu * (np.arange(n + 1) / n)",
         "privacy/test_gaussian.py",
+    ),
+    Mutant(
+        "what is spent is what a vehicle has truly paid", 24, "release/paced.py",
+        "return self._losses(self._charged[episodes])",
+        "return self._losses(self.ledgers.paid[episodes].max(axis=2, initial=0.0))",
+        "test_non_interference.py",
     ),
     Mutant(
         "epsilon is rounded down to a level of mu", 24, "privacy/gaussian.py",
