@@ -207,7 +207,7 @@ MUTANTS = (
         "a deviation is charged before it is rounded", 6, "release/vehicles.py",
         "d = steps * grid[c]",
         "d = min(max(min(reported, fastest) - centre[k, s], -clip), clip)",
-        "test_guarantee.py",
+        "release/test_vehicles.py",
     ),
     Mutant(
         "a deviation at the clip is rounded up", 6, "release/vehicles.py",
@@ -260,7 +260,7 @@ MUTANTS = (
     Mutant(
         "vehicles that are not connected are counted", 9, "release/vehicles.py",
         "if reported < 0.0:", "if reported < -1.0:",
-        "test_guarantee.py",
+        "release/test_vehicles.py",
     ),
     Mutant(
         "vehicles that are not connected report", 9, "traffic/penetration.py",
