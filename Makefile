@@ -40,8 +40,8 @@ reproduce: setup  ## Write the reports of all studies anew, after playing what t
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/dptse audit --force --env dptse_env:dptse/PaperHighway-v0 --target replaced
 	$(BIN)/dptse audit --force --env 'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected"}' --target replaced
-	$(BIN)/dptse audit --force --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
-	$(BIN)/dptse audit --force --env dptse_env:dptse/PrivateHighway-v0
+	$(BIN)/dptse audit --force --env 'dptse_env:dptse/PrivateHighway-v1 {"privacy": "capped"}' --noise-factor 0.709
+	$(BIN)/dptse audit --force --env 'dptse_env:dptse/PrivateHighway-v1 {"privacy": "capped"}'
 	$(BIN)/dptse audit --force --noise-factor 0.709
 	$(BIN)/dptse audit --force
 	$(BIN)/dptse audit --force --target replaced

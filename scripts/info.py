@@ -20,10 +20,10 @@ from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.threads import n_cores
 
 PACKAGES = (
-    "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "filterpy",
-    "qpsolvers", "piqp", "safetensors", "matplotlib", "platformdirs", "tomli-w", "tqdm", "torch",
-    "stable-baselines3", "sb3-contrib", "optuna", "plotly", "polars", "loky", "rich", "tyro",
-    "ray", "filelock", "moviepy", "pygame",
+    "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "mpmath",
+    "filterpy", "qpsolvers", "piqp", "safetensors", "matplotlib", "platformdirs", "tomli-w",
+    "tqdm", "torch", "stable-baselines3", "sb3-contrib", "optuna", "plotly", "polars", "loky",
+    "rich", "tyro", "ray", "filelock", "moviepy", "pygame",
 )  # fmt: skip
 
 

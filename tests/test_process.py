@@ -104,14 +104,14 @@ def test_an_episode_may_pause_while_others_go_on():
 
 def test_residuals_are_the_noise_that_is_declared():
     """Released minus true over sigma: unit variance, uncorrelated over time and quantities."""
-    privacy = {"boundary_inputs": "private", "share": 0.3}
+    privacy = {"preset": "capped", "boundary_inputs": "private", "share": 0.3}
     keywords = {"estimator": "random_walk", "horizon": 120, "traffic_seeds": "0:1"}
     process = make(1, "private-highway", privacy=privacy, **keywords)
     residuals, added = [], process.release.noise.added
 
     def spy(episodes, values, sigma, unit):
         released = added(episodes, values, sigma, unit)
-        residuals.append((released - values)[0] / process.release.sigma)
+        residuals.append((released - values / unit[:, None])[0] / process.release.sigma)
         return released
 
     process.release.noise.added = spy

@@ -46,7 +46,7 @@ def exact_delta(mu, epsilon):
     with mpmath.workdps(60):
         mu, epsilon = mpmath.mpf(mu), mpmath.mpf(epsilon)
         first = mpmath.ncdf(mu / 2 - epsilon / mu)
-        return float(first - mpmath.exp(epsilon) * mpmath.ncdf(-mu / 2 - epsilon / mu))
+        return first - mpmath.exp(epsilon) * mpmath.ncdf(-mu / 2 - epsilon / mu)
 
 
 # --- relations -------------------------------------------------------------------------------
@@ -76,7 +76,7 @@ def test_golden_multipliers(epsilon, delta, kappa, analytic, digits):
 def test_delta_matches_the_definition_in_many_digits(mu, deviations):
     """Over the whole of its range: `deviations` is minus the argument of the leading term."""
     epsilon = max(mu * (deviations + mu / 2.0), 0.0)
-    assert delta_of(mu, epsilon) == close(exact_delta(mu, epsilon), 2e-11)
+    assert delta_of(mu, epsilon) == close(float(exact_delta(mu, epsilon)), 2e-11)
 
 
 @few
@@ -85,6 +85,24 @@ def test_epsilon_and_the_multiplier_match_dp_accounting(mu, epsilon, delta):
     oracle = get_epsilon_gaussian(1.0 / mu, delta, tol=1e-15)
     assert epsilon_of(mu, delta) == pytest.approx(oracle, rel=1e-11, abs=1e-13)
     assert 1.0 / mu_of(epsilon, delta) == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-11)
+
+
+@settings(deadline=None)
+@given(epsilon=logarithmic(1e-4, 1e4), delta=logarithmic(1e-12, 0.4999))
+@example(epsilon=5.0, delta=1e-12)
+@example(epsilon=20.0, delta=0.05)
+@example(epsilon=1e-4, delta=0.05)
+@example(epsilon=1e4, delta=1e-12)
+@example(epsilon=1.759694e-4, delta=3.201763e-4)  # a mu just above where the formula changes
+@example(epsilon=3.147896e-4, delta=3.339089e-4)
+def test_mu_is_exact_to_twice_ten_to_the_minus_twelve_wherever_a_guarantee_may_be(epsilon, delta):
+    """By Newton's step from it, whose slope is the density of the leading term, in 60 digits."""
+    mu = mu_of(epsilon, delta)
+    with mpmath.workdps(60):
+        excess = exact_delta(mu, epsilon) - mpmath.mpf(delta)
+        slope = mpmath.npdf(mpmath.mpf(mu) / 2 - mpmath.mpf(epsilon) / mu)
+        assert abs(excess / slope / mu) < 2e-12
+    assert 1.0 / mu == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-11)
 
 
 @settings(deadline=None)

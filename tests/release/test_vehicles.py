@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dptse_env.release import Group, PacedSettings, Traffic
-from dptse_env.release.vehicles import Ledgers
+from dptse_env.release.vehicles import Ledgers, require_exact_sums
 from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
 from tests.helpers import UNEVEN, pairwise
 
@@ -122,3 +122,10 @@ def test_a_reset_begins_new_budgets_in_its_episodes_alone_and_a_wider_record_kee
     (told,) = ledgers.of(ONE, np.array([20]))
     np.testing.assert_array_equal(told, kept)
     assert not np.shares_memory(told, ledgers.paid)
+
+
+@pytest.mark.parametrize(("sigma", "clip"), [((1e-7, 1.0), 25.0), ((1.0, 1e-6), 25.0)])
+def test_noise_too_small_for_exact_sums_is_refused(sigma, clip):
+    require_exact_sums(np.ones(2), clip)
+    with pytest.raises(ValueError, match=r"^privacy\.epsilon must be smaller: sums of 1048576"):
+        require_exact_sums(np.array(sigma), clip)

@@ -30,8 +30,8 @@ class LedgerForEachSegment(Ledgers):
 class ReleasedUnclipped(Ledgers):
     """Releases what it charges for as if it were clipped."""
 
-    def collect(self, episodes, observed, rows, prices, centre):
-        sums, refused = super().collect(episodes, observed, rows, prices, centre)
+    def collect(self, episodes, observed, rows, prices, centre, sigma):
+        sums, refused = super().collect(episodes, observed, rows, prices, centre, sigma)
         # All vehicles on the audited segments stand: each deviates by the centre.
         sums[..., 1] = -sums[..., 0] * centre[:, : observed.shape[1]]
         return sums, refused

