@@ -1,4 +1,4 @@
-"""The environment under presets that guarantee privacy: account, warnings, truth."""
+"""The environment under presets that guarantee privacy: account, warnings, truth, distances."""
 
 import dataclasses
 import json
@@ -18,8 +18,8 @@ from dptse_env.process import QueryProcess
 from dptse_env.release import CappedSettings, Detectors, PacedSettings, Pacing, Request
 from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
 from tests.helpers import AWAY, fast_and_slow, make_env, play, record
+from tests.release.worlds import ONE, Worlds
 
-ONE = np.arange(1)
 CAPPED, PACED = {"preset": "capped", "cap": 5}, {"preset": "paced", "epsilon": 0.5}
 
 
@@ -147,19 +147,6 @@ class Known(Penetration):
         return uniform
 
 
-class Library:
-    """Records by their traffic seeds."""
-
-    def __init__(self, records):
-        self.records = records
-
-    def get(self, corridor, seed):
-        return self.records[seed]
-
-    def ensure(self, corridor, seeds):
-        """All records are there."""
-
-
 class Silence:
     """In place of noise: keeps what it would be added to, and its deviations."""
 
@@ -179,7 +166,7 @@ class Eavesdropper:
     """
 
     def __init__(self, config, records):
-        self.process = QueryProcess(make_parts(config, library=Library(records)))
+        self.process = QueryProcess(make_parts(config, library=Worlds(*records)))
         self.copies = make_release(config, 4, self.process.traffic)
         self.copies.noise = Silence()
         self.process.traffic.load(np.arange(len(records)))
