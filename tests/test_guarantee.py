@@ -108,9 +108,9 @@ def test_a_spec_with_every_keyword_of_paced_ledgers_survives_json():
 # the true sums. Their distance, in units of the noise, is a fraction without any rounding.
 
 HORIZON, DURATION = 30, 33
-PAIR, COMMON = (0, 1), 4
-"""Traffic seeds of the two worlds, and of a record that both have; 2 and 3 are a world each in
-which the vehicle that differs is alone."""
+COMMON = 4
+"""Traffic seed of a record that both worlds have. Theirs are 0 and 1; in 2 and 3 the vehicle that
+differs is alone."""
 ROAD = dataclasses.replace(SHORT_HIGHWAY, duration=DURATION, incident=None)
 PLACES = ROAD.n_segments + ROAD.n_boundaries
 ESTIMATORS = ("ekf", "random_walk", "recurrent", "ukf", "enkf", "mhe")
@@ -175,7 +175,7 @@ class Eavesdropper:
 
     def begin(self, world, traffic, seed):
         """Begin an episode of one of the two worlds; `traffic` are the records of the copies."""
-        self.square, self.traffic, self._world = Fraction(), np.array(traffic), world
+        self.square, self.traffic = Fraction(), np.array(traffic)
         self.copies.reset(np.arange(4), [np.random.default_rng()] * 4)
         options = {"traffic_seed": int(traffic[world])}
         self.process.reset(ONE, [np.random.default_rng(seed)], options)
