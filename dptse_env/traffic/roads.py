@@ -258,7 +258,7 @@ def _content(path: Path) -> dict[str, Any]:
     except OSError as problem:
         raise ValueError(f"{path}: the road file cannot be read: {problem.strerror}") from problem
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
-        raise ValueError(f"{path}: a road file must be TOML: {cut(str(problem))}") from problem
+        raise ValueError(f"{path}: a road file must be TOML: {cut(problem)}") from problem
 
 
 def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:

@@ -276,7 +276,7 @@ def shown(value: Any) -> str:
 
 def cut(value: Any) -> str:
     """Return a key, a name or a reason for a message: without quotes, escaped and cut."""
-    text = value if isinstance(value, str) else shown(value)
+    text = str(value) if isinstance(value, str | Exception) else shown(value)
     text = text if text.isprintable() else repr(text)[1:-1]
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
@@ -351,7 +351,7 @@ def parse_json(text: str | bytes, path: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as problem:
-        raise ValueError(f"{path} must be JSON: {cut(str(problem))}") from problem
+        raise ValueError(f"{path} must be JSON: {cut(problem)}") from problem
 
 
 def read_json(path: str | Path) -> Any:
