@@ -1,6 +1,6 @@
 """Random configurations and hostile files: each works, or is refused in one line with a path.
 
-    python -m tests.fuzz                     # 1,000 configurations and 400 files, an hour
+    python -m tests.fuzz                     # 1,000 configurations and 400 files, ten minutes
     python -m tests.fuzz --only roads:17     # one of them again
 
 A case is drawn from the seed, its kind and its number, and tried in a process of its own kind: it
