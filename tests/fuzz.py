@@ -102,7 +102,10 @@ def some(hint, rng, wrong=0.02):
     if origin is typing.Literal:
         return items[rng.integers(len(items))]
     if origin is tuple and items[1:] == (...,):
-        return [some(items[0], rng, wrong) for _ in range(rng.integers(5))]
+        values = [some(items[0], rng, wrong) for _ in range(rng.integers(5))]
+        with contextlib.suppress(TypeError, IndexError):  # steps from time 0 on, rather
+            values = [[0.0, *values[0][1:]], *sorted(values[1:])] if rng.random() < 0.8 else values
+        return values
     if origin is tuple:
         return [some(each, rng, wrong) for each in items]
     if dataclasses.is_dataclass(hint):
@@ -145,11 +148,18 @@ NAMES = {
     "estimator_settings": [*available_settings(), "none.json"],
     "action": [*ACTION_ENCODINGS],
     "reward": [*REWARDS],
+    "backend": ["compiled", "compiled", "reference"],
+    "query_spans": [[1], [1, 2], [1, 2, 4], [2]],
+    "price_levels": [[1.0], [0.5, 1, 2]],
+    "bandwidth_unit": ["segments", "sums"],
+    "bandwidth": [1, 2, 3, 1000],
+    "horizon": [1, 5, 240, 241],
     "incident": ["preset", "none", "random"],
     "demand": ["preset", "random"],
     "traffic_seeds": ["0:2", "0:20000", "1:0", [0, 1], [1, 1], [], [5e-324]],
 }
 """What keywords may be beside mappings of fields."""
+ONLY_NAMES = ("estimator", "action", "reward", "backend", "bandwidth_unit")
 
 
 def keyword(name, rng, given):
@@ -157,11 +167,11 @@ def keyword(name, rng, given):
     hints = {**field_hints(EnvConfig), **field_hints(type(SHORT_HIGHWAY))}
     if rng.random() < 0.05:
         return ODD[rng.integers(len(ODD))]
-    if name in NAMES and (rng.random() < 0.4 or name in ("estimator", "action", "reward")):
+    if name in NAMES and (rng.random() < 0.5 or name in ONLY_NAMES):
         return one_of(NAMES[name], rng)
     match name:
         case "epsilon" | "delta":
-            return float(10.0 ** rng.uniform(-9, 3))
+            return float(10.0 ** rng.uniform(-5, 3 if name == "epsilon" else 0))
         case "parameters":
             return some_fields(ARZParameters, rng, 0.02)
         case "estimator_settings":
@@ -189,7 +199,7 @@ def configuration(rng, _folder):
         if name in chosen:
             keywords[name] = keyword(name, rng, keywords)
     if rng.random() < 0.02:
-        keywords["no_such\nkeyword"] = 1
+        keywords = {"no_such\nkeyword": 1}  # alone, since Gymnasium repeats all of them
     return {"id": env, **keywords}, lambda: play(env, keywords), PATHS
 
 

@@ -40,9 +40,10 @@ TOKENS = (
     b"9" * 5000, b"1e999", b"-1e999", b"nan", b"inf", b"-1", b"0", b"5e-324", b"1e308", b"1e9",
     b"99999999999999999999", b'"', b'""', b'"a\\nb"', b'"no_such_module:Part"', b"'", b"[" * 3000,
     b"{" * 3000, b'{"a":' * 3000, b"]", b"}", b"=", b",", b"<", b"null", b"true", b"x" * 10_000,
-    b"\0", b"\xff\xfe", b"\r", b"\n", b"",
+    b"\0", b"\xff\xfe", b"\r", b"\n", b"", b"1", b"2", b"3", b"7.5", b"0.2", b"100", b"true",
+    b"1", b"2", b"0.5", b"60",
 )  # fmt: skip
-"""What takes the place of a word of a text, or a few bytes of it."""
+"""What takes the place of a word of a text, or a few bytes of it; some of it may be in order."""
 
 
 def changed(content, rng):
