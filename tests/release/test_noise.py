@@ -133,6 +133,21 @@ def test_where_all_noise_is_in_doubt_releases_are_the_same(monkeypatch):
     np.testing.assert_array_equal(drawn(started(1), 3, ONE), certain)
 
 
+def test_just_what_an_error_could_take_to_another_integer_and_what_is_far_is_settled(monkeypatch):
+    """Numbers are three times as large as normal ones, and a settled one shows as 7."""
+    monkeypatch.setattr(module, "rounded_normal", lambda scale, bits, more: 7)
+    monkeypatch.setattr(module, "normal_of", lambda bits: 3.0 * normal_of(bits))
+    monkeypatch.setattr(module, "DOUBT", 2.0**-15)
+    found = drawn(started(0), BLOCK) / np.array([2.0**-6, 2.0**-7])
+    bits = streams(0)[0].integers(2**64, size=(BLOCK, 1, S, 2), dtype=np.uint64)
+    z, scale = 3.0 * normal_of(bits), SIGMA / np.array([2.0**-6, 2.0**-7])
+    error = 2.0**-15 * (1.0 + abs(z))
+    low, high, far = np.rint(scale * (z - error)), np.rint(scale * (z + error)), abs(z) > FAR
+    np.testing.assert_array_equal(found, np.where((low != high) | far, 7.0, low))
+    assert (far & (low == high)).any()
+    assert 0.1 < (low != high).mean() < 0.9
+
+
 @pytest.mark.parametrize("source", ["seeded", "secure"])
 def test_released_integers_have_the_probabilities_of_a_rounded_gaussian(source):
     scale, columns = 1500.3, 5000
