@@ -376,7 +376,7 @@ MUTANTS = (
     ),
     Mutant(
         "what is settled has one sign", 16, "release/noise.py",
-        "return found if bits & 1 else -found", "return found",
+        "return -found if bits & 1 else found", "return found",
         "release/test_noise.py",
     ),
     Mutant(
