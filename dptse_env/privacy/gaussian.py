@@ -18,6 +18,7 @@ $b$, so the second term is $\varphi(a)$ times a ratio that stays of order one.
 """
 
 import math
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -26,10 +27,13 @@ from scipy.special import erfcx, log_ndtr, ndtri
 
 from dptse_env.privacy.sensitivity import Sensitivity
 from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.fields import inside, positive, require
+from dptse_env.utils.fields import inside, integer, positive, require
 
 DELTAS = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")
 """Values of delta at which reports give epsilon."""
+
+TRIPS = (1, 2, 10, 50, 250)
+"""Numbers of trips that an account over days is given for."""
 
 ROUNDING = 2.0**-30
 """Part of every privacy budget mu^2 that is kept back for rounding in double precision.
@@ -108,6 +112,19 @@ def epsilon_of(mu: float, delta: float) -> float:
 def epsilons_of(mu: float) -> dict[str, float]:
     """Return epsilon at each of `DELTAS`, by its name."""
     return {name: epsilon_of(mu, float(name)) for name in DELTAS}
+
+
+def over_trips(mu: float, trips: Sequence[int] = TRIPS) -> dict[int, dict[str, float]]:
+    """Privacy loss of one vehicle that makes several trips, each of parameter `mu`.
+
+    With independent noise n trips have the parameter mu sqrt(n) (Dong, Roth and Su 2022, corollary
+    3.3). A vehicle that changes its pseudonym remains one vehicle here.
+
+    Returns:
+        For each number of trips ``"mu"``, and epsilon by the name of each of `DELTAS`.
+    """
+    mus = {n: positive("mu", mu) * math.sqrt(integer("trips", n, 1)) for n in trips}
+    return {n: {"mu": total, **epsilons_of(total)} for n, total in mus.items()}
 
 
 def mu_of(epsilon: float, delta: float) -> float:

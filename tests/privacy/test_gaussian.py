@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dptse_env.privacy import (
+    DELTAS,
     EpsilonTable,
     ReleaseAccount,
     contribution_sensitivity,
@@ -19,6 +20,7 @@ from dptse_env.privacy import (
     joint_noise_std,
     le_ny_kappa,
     mu_of,
+    over_trips,
     paper_sensitivity,
     printed_noise_std,
     single_noise_std,
@@ -243,3 +245,15 @@ def test_an_account_charges_a_step_for_each_contribution_and_the_paper_s_all_at_
     assert whole.spent(np.array([0, 7]))[0].tolist() == [2.0, 2.0]
     found = account.epsilons(np.array([0.0, 1.0, 4.0, 9.0]))
     assert found == pytest.approx(epsilon.tolist())
+
+
+def test_trips_of_one_vehicle_compose():
+    for n, row in over_trips(1.02, (1, 4, 250)).items():
+        mu = row.pop("mu")
+        assert mu == pytest.approx(math.hypot(*[1.02] * n), rel=1e-14)
+        assert list(row) == list(DELTAS)
+        for delta, epsilon in row.items():
+            assert epsilon == close(get_epsilon_gaussian(1.0 / mu, float(delta)), 1e-9)
+    for mu, trips in ((0.0, 1), (1.0, 0), (1.0, 1.5)):
+        with pytest.raises(ValueError, match=r"^(mu|trips) must be"):
+            over_trips(mu, (trips,))
