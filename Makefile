@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo reproduce audit test test-slow test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
+.PHONY: help setup docs site dist demo reproduce audit test test-slow mutants test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -40,8 +40,8 @@ reproduce: setup  ## Write the reports of all studies anew, after playing what t
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
 	$(BIN)/dptse audit --force --env dptse_env:dptse/PaperHighway-v0 --target replaced
 	$(BIN)/dptse audit --force --env 'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected"}' --target replaced
-	$(BIN)/dptse audit --force --env dptse_env:dptse/PrivateHighway-v0 --noise-factor 0.709
-	$(BIN)/dptse audit --force --env dptse_env:dptse/PrivateHighway-v0
+	$(BIN)/dptse audit --force --env 'dptse_env:dptse/PrivateHighway-v1 {"privacy": "capped"}' --noise-factor 0.709
+	$(BIN)/dptse audit --force --env 'dptse_env:dptse/PrivateHighway-v1 {"privacy": "capped"}'
 	$(BIN)/dptse audit --force --noise-factor 0.709
 	$(BIN)/dptse audit --force
 	$(BIN)/dptse audit --force --target replaced
@@ -55,6 +55,9 @@ test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
 
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
 	$(BIN)/python -m pytest -m 'slow and not ray' -n 2 --dist loadfile
+
+mutants: setup  ## Break each line of the proof in a copy, and see a fast test fail; ten minutes.
+	$(BIN)/python -m tests.mutants
 
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/gymnasium gymnasium==1.2.2

@@ -92,13 +92,11 @@ def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> Senso
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Suppress warnings of a void guarantee, of an id with a newer version, and of other traffic.
+    """Suppress warnings of a void guarantee and of other traffic.
 
-    A study reports the guarantee itself, names the version that it is about, and may be about
-    traffic for which nothing was tuned.
+    A study reports the guarantee itself, and may be about traffic for which nothing was tuned.
     """
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=r".*is out of date\. You should consider")
         warnings.filterwarnings("ignore", message=r"privacy\.preset is .* yet no privacy")
         warnings.filterwarnings("ignore", message=".*values measured or tuned on")
         yield

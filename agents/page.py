@@ -54,7 +54,7 @@ class Watched:
         process, n = self._process, self._process.interface.n_mainline
         self.history.append(process)
         self.density_std.append(process.estimate.density_std[0, :n].copy())
-        self.epsilon.append(float(process.info(0)["epsilon"]))
+        self.epsilon.append(float(process.info(0)["spent_epsilon"]))
 
     def rows(self) -> list[Row]:
         """See `dptse_env.evaluation.Watcher.rows`: no further columns."""

@@ -24,7 +24,6 @@ from dptse_env.model.parameters import read_parameters
 from dptse_env.release import (
     RELEASE_MODELS,
     BandwidthUnit,
-    CappedSettings,
     Detectors,
     FusionSettings,
     PacedSettings,
@@ -259,11 +258,6 @@ class EnvConfig:
 PRESETS = {
     "paper-highway": EnvConfig(corridor=CORRIDORS["paper-highway"]),
     "private-highway": EnvConfig(
-        corridor=randomised(CORRIDORS["paper-highway"]),
-        parameters="w99-3lane",
-        privacy=CappedSettings(epsilon=5.0, cap=64),
-    ),
-    "private-highway-v1": EnvConfig(
         corridor=randomised(CORRIDORS["paper-highway"]),
         parameters="w99-3lane",
         privacy=PacedSettings(epsilon=5.0),

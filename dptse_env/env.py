@@ -103,8 +103,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | ``queried``         | the options that were queried, flags of shape (G,)                     |
     | ``diverged``        | 1 if the estimator diverged in this second and was started anew        |
     | ``fallback``        | 1 if its update had no solution in this second: it only predicted      |
-    | ``mu``              | privacy loss of a vehicle so far, at most: Gaussian DP parameter       |
-    | ``epsilon``         | the same as epsilon at the configured delta                            |
+    | ``spent_mu``        | privacy loss of a vehicle so far, at most: Gaussian DP parameter       |
+    | ``spent_epsilon``   | the same as epsilon at the configured delta                            |
     | ``prices``          | under ``paced``: last price of each option, 0 before, shape (G,)       |
     | ``tracer``          | under ``paced``: as in the observation, shape (n,)                     |
     | ``centre_fallback`` | under ``paced``: 1 if no prediction was finite to centre flows on      |
@@ -113,8 +113,9 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | ``inherited``       | at the reset only: keywords whose values belong to another road        |
 
     Values marked "true traffic" serve training and evaluation, as the reward does. They are not
-    covered by the guarantee, and no policy may act on them. The others are public. A guarantee is
-    about complete episodes: it is that of the last ``mu`` and ``epsilon``.
+    covered by the guarantee, and no policy may act on them. The others are public. ``spent_mu`` and
+    ``spent_epsilon`` read like an odometer: what is guaranteed is the budget of a complete episode,
+    ``mu`` in ``privacy``.
 
     **Arguments** of ``gym.make``, with the defaults of ``PaperHighway-v0``. All are plain JSON, but
     for parts of your own (a class or ``"package.module:Class"``). ``docs/configuration.md`` has
@@ -155,7 +156,6 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | id                  | n   | S   | record | release, epsilon | bandwidth | demand, incident |
     | :--                 | :-- | :-- | :--    | :--              | :--       | :--              |
     | `PaperHighway-v0`   | 15  | 19  | 700 s  | paper, 1         | 5         | fixed            |
-    | `PrivateHighway-v0` | 15  | 19  | 700 s  | capped, 5        | 5         | random           |
     | `PrivateHighway-v1` | 15  | 19  | 700 s  | paced, 5         | 5         | random           |
     | `LongHighway-v0`    | 120 | 128 | 1200 s | paced, 5         | 8         | random           |
     | `ShortHighway-v0`   | 6   | 8   | 240 s  | paper, 1         | 2         | fixed            |

@@ -105,7 +105,12 @@ class QueryProcess:
         A fork that is stepped like its origin gives the same bits, and the origin is not affected.
         It shares traffic and model and cannot be reset. One of a single episode takes some 0.6 ms
         to make, one of 64 some 70 us an episode.
+
+        Raises:
+            RuntimeError: The noise is secure: two releases with the same noise have no guarantee.
         """
+        if self.config.privacy.noise == "secure":
+            raise RuntimeError("a process whose privacy.noise is 'secure' has no forks")
         shared = (
             self.config, self.interface, self.model, self.traffic, self._threads,
             self.release.task, *self.boundary.shared,
@@ -124,8 +129,9 @@ class QueryProcess:
 
         Args:
             episodes: Shape (k,).
-            generators: One generator per episode; each gives a seed for the traffic, the noise and
-                the estimator, whatever the configuration.
+            generators: One generator per episode; each gives 128 bits, of which the independent
+                streams of traffic, noise, estimator and detectors are spawned, whatever the
+                configuration.
             options: ``traffic_seed`` fixes the traffic (one of ``config.traffic_seeds``) and
                 ``start`` the first second of the record; each one value, or k of them.
 
@@ -137,22 +143,20 @@ class QueryProcess:
         if self._is_fork:
             raise RuntimeError("a fork cannot be reset: reset the process that it was made from")
         choice = ResetOptions.from_mapping(options, self.config, len(episodes))
-        streams = [
-            [np.random.default_rng(seed) for seed in generator.integers(2**63, size=3)]
-            for generator in generators
-        ]
-        traffic, starts = choice.draw([stream for stream, _, _ in streams])
+        streams = [list(map(np.random.default_rng, _seed_of(each).spawn(4))) for each in generators]
+        for_traffic, for_noise, for_estimator, for_detectors = zip(*streams, strict=True)
+        traffic, starts = choice.draw(for_traffic)
         for index in self.traffic.load(traffic):
             self.boundary.load(index)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
         self.end[episodes] = starts + self.config.horizon_steps
         self.pending.reset(episodes)
         if self.detectors is not None:
-            self.detectors.reset(episodes, [noise.spawn(1)[0] for _, noise, _ in streams])
-        self.release.reset(episodes, [noise for _, noise, _ in streams])
+            self.detectors.reset(episodes, for_detectors)
+        self.release.reset(episodes, for_noise)
         self.boundary.reset(episodes)
         prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
-        self.estimator.reset(episodes, prior, [draws for _, _, draws in streams])
+        self.estimator.reset(episodes, prior, for_estimator)
         self.queried[episodes] = False
         self.n_dropped[episodes] = 0
         self.age[episodes] = AGE_CAP
@@ -327,8 +331,8 @@ class QueryProcess:
             "n_dropped": self.n_dropped[episodes].astype(np.float64),
             "diverged": self.estimator.diverged[episodes].astype(np.float64),
             "fallback": self.estimator.fallback[episodes].astype(np.float64),
-            "mu": mu,
-            "epsilon": epsilon,
+            "spent_mu": mu,
+            "spent_epsilon": epsilon,
             "queried": self.queried.take(episodes, 0),
             **self.release.public(episodes),
         }
@@ -345,6 +349,11 @@ class QueryProcess:
             "time": self.time[episodes],
             **self.release.private(episodes, traffic),
         }
+
+
+def _seed_of(generator: np.random.Generator) -> np.random.SeedSequence:
+    """Return a seed of 128 bits from a generator."""
+    return np.random.SeedSequence(generator.integers(2**32, size=4, dtype=np.uint32).tolist())
 
 
 RESET_OPTIONS = ("traffic_seed", "start")

@@ -10,8 +10,7 @@ from gymnasium.envs.registration import register, registry
 
 ENVIRONMENTS = {
     "dptse/PaperHighway-v0": "paper-highway",
-    "dptse/PrivateHighway-v0": "private-highway",
-    "dptse/PrivateHighway-v1": "private-highway-v1",
+    "dptse/PrivateHighway-v1": "private-highway",
     "dptse/LongHighway-v0": "long-highway",
     "dptse/ShortHighway-v0": "short-highway",
 }

@@ -40,8 +40,8 @@ FROM_SECOND, STEPS = 240, 3  # a queue stands on the paper's road from second 20
 ROADS: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": ("PaperHighway-v0", {}),
     "paper-w99": ("PaperHighway-v0", {"parameters": "w99-3lane"}),
-    "corrected": ("PrivateHighway-v0", {"privacy": "corrected"}),
-    "capped": ("PrivateHighway-v0", {}),
+    "corrected": ("PrivateHighway-v1", {"privacy": "corrected"}),
+    "capped": ("PrivateHighway-v1", {"privacy": "capped"}),
     "paced": ("PrivateHighway-v1", {}),
     "paced-spans": ("PrivateHighway-v1", {"query_spans": [1, 2]}),
     "paced-uneven": ("PrivateHighway-v1", {"corridor": "uneven", "horizon": 300}),
@@ -49,18 +49,14 @@ ROADS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Environments whose estimators take steps from recorded states."""
 
-IDS = ("PaperHighway-v0", "PrivateHighway-v0", "PrivateHighway-v1", "ShortHighway-v0",
-       "LongHighway-v0")  # fmt: skip
+IDS = ("PaperHighway-v0", "PrivateHighway-v1", "ShortHighway-v0", "LongHighway-v0")
 SCHEDULES = (
     "static", "paper", "round-robin", "random", "oldest-first", "largest-variance",
     "largest-density-variance", "stale-variance", "largest-deviation", "speed-front", "none",
     "expected-reduction", "greedy-trace", "oracle-error", "oracle-gain",
 )  # fmt: skip
-POLICIES = {
-    "private-highway": "PrivateHighway-v0",
-    "capped-roads": "PrivateHighway-v0",
-    "paced-roads": "PrivateHighway-v1",
-}
+POLICIES = {"private-highway": "capped", "capped-roads": "capped", "paced-roads": "paced"}
+"""Shipped policies and the release models that they were trained for."""
 RELEASES: dict[str, dict[str, Any]] = {
     "paper": {"privacy": "paper"},
     "corrected": {"privacy": "corrected"},
@@ -173,25 +169,26 @@ def observations(name: str) -> Numbers:
     env = _make(name)
     schedule = make_schedule("paper", env)
     observation, info = env.reset(seed=11)
-    rows, rewards, spent, state = [observation], [], [info["mu"]], None
+    rows, rewards, spent, state = [observation], [], [info["spent_mu"]], None
     for _ in range(SECONDS):
         action, state = schedule.predict(observation, state, np.array([state is None]), True)
         observation, reward, _, _, info = env.step(action)
         rows.append(observation)
         rewards.append(reward)
-        spent.append(info["mu"])
+        spent.append(info["spent_mu"])
     kept = {"observations": _projected(rows), "rewards": rewards, "mu": spent}
     return {key: np.array(value, dtype=np.float32) for key, value in kept.items()}
 
 
-def choices(policy: str, name: str = "PrivateHighway-v1") -> Numbers:
+def choices(policy: str) -> Numbers:
     """Return the queries of a schedule or a shipped policy over `SECONDS`, packed as bits."""
+    make = functools.partial(_make, "PrivateHighway-v1", horizon=SECONDS)
     if policy in POLICIES:
         saved = read_saved_policy(policy)
-        env = _make(name, horizon=SECONDS, **saved.keywords)
+        env = make(privacy=POLICIES[policy], **saved.keywords)
         player = saved.load(env, allow=TRANSFERABLE)
     else:
-        env = _make(name, horizon=SECONDS)
+        env = make()
         player = make_schedule(policy, env, 3)
     observation, info = env.reset(seed=4)
     state, queried = None, []
@@ -225,7 +222,7 @@ def releases(case: str) -> Numbers:
         action = np.zeros(n_options, dtype=np.int8)
         action[rng.choice(n_options, min(2, n_queries), replace=False)] = 1
         *_, info = env.step(action)
-        spent.append(info["mu"])
+        spent.append(info["spent_mu"])
     return {
         "values": _projected(values),
         "sigma": _projected(sigma),
@@ -252,8 +249,8 @@ def cases() -> Iterator[tuple[str, Any, tuple[Any, ...]]]:
         yield f"id {name}", observations, (name,)
     for schedule in SCHEDULES:
         yield f"schedule {schedule}", choices, (schedule,)
-    for policy, name in POLICIES.items():
-        yield f"policy {policy}", choices, (policy, name)
+    for policy in POLICIES:
+        yield f"policy {policy}", choices, (policy,)
     for case in RELEASES:
         yield f"release {case}", releases, (case,)
     for name in ("PaperHighway-v0", "PrivateHighway-v1"):

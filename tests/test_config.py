@@ -42,7 +42,7 @@ SUMS = "tests.helpers:SumRelease"
 PRIVACY = {
     "preset": "capped", "epsilon": 2, "delta": 0.01, "unit": "horizon", "cap": 8,
     "adjacency": "add_remove", "share": 0.25, "speed_release": "flow",
-    "boundary_inputs": "private",
+    "boundary_inputs": "private", "noise": "secure",
 }  # fmt: skip
 WHOLE = [
     {"incident": "random", "demand": "random"},
@@ -118,7 +118,7 @@ def test_tuned_settings_are_found_by_estimator_parameters_privacy_and_road():
     long = resolve("long-highway", {})
     assert long.settings_name == "ekf-w99-3lane-paced-long-highway"
     assert resolve("long-highway", {"estimator": "mhe"}).settings_name == "mhe-w99-3lane-paced"
-    assert resolve("private-highway-v1", {}).settings_name == "ekf-w99-3lane-paced"
+    assert resolve("private-highway", {}).settings_name == "ekf-w99-3lane-paced"
     # `ekf-w99-3lane-capped-demand` is a variant, not a set for a road that is called demand.
     keywords = {"parameters": "w99-3lane", "privacy": "capped", "corridor": {"name": "demand"}}
     assert resolve("paper-highway", keywords).settings_name == "ekf-w99-3lane-capped"
@@ -168,10 +168,13 @@ def test_settings_that_an_estimator_cannot_have_are_refused_when_it_is_made():
 
 def test_bad_privacy_is_named_with_its_path():
     for privacy, message in (
-        ({"cap": 2.5}, "cap must be"),
+        ({"preset": "capped", "cap": 2.5}, "cap must be"),
         ({"epsilon": 0}, "epsilon must be"),
         ({"unit": "week"}, "unit must be one of"),
-        ({"speed_release": "mean", "adjacency": "add_remove"}, "adjacency must be 'replace'"),
+        (
+            {"preset": "capped", "speed_release": "mean", "adjacency": "add_remove"},
+            "adjacency must be 'replace'",
+        ),
         ({"preset": "paper", "speed_release": "flow"}, "speed_release is unknown"),
     ):
         with pytest.raises(ValueError, match=rf"^privacy\.{message}"):
@@ -179,13 +182,17 @@ def test_bad_privacy_is_named_with_its_path():
 
 
 def test_neither_bandwidth_nor_sensors_enter_an_honest_bound_but_the_papers():
-    private = {"privacy": {"boundary_inputs": "private"}}
     more = {"bandwidth": 15, "corridor": {"fixed_sensors": [0, 7, 14]}}
     first, *others = (
-        make_release(resolve("private-highway", keywords)).sensitivity
-        for keywords in ({}, more, private)
+        make_release(resolve("private-highway", {**keywords, "privacy": privacy})).sensitivity
+        for keywords, privacy in (
+            ({}, "capped"),
+            (more, "capped"),
+            ({}, {"preset": "capped", "boundary_inputs": "private"}),
+        )
     )
     assert others == [first, first]
+    private = {"privacy": {"boundary_inputs": "private"}}
     fewer, more = (make_release(resolve("paper-highway", k)).sensitivity[0] for k in ({}, private))
     assert dict(fewer.assumptions)["n_sensors"] == 8
     assert dict(more.assumptions)["n_sensors"] == 8 + PAPER_HIGHWAY.n_boundaries
@@ -199,7 +206,7 @@ def test_neither_bandwidth_nor_sensors_enter_an_honest_bound_but_the_papers():
     ],
 )
 def test_a_void_guarantee_is_warned_of_with_its_reason(reason, privacy):
-    config = resolve("private-highway", {"privacy": privacy})
+    config = resolve("private-highway", {"privacy": {"preset": "capped", **privacy}})
     with pytest.warns(UserWarning, match=f"no privacy is guaranteed. {reason}: ") as caught:
         warn_where_void(config)
     assert len(caught) == 1
@@ -207,7 +214,7 @@ def test_a_void_guarantee_is_warned_of_with_its_reason(reason, privacy):
 
 
 def test_no_warning_where_no_guarantee_is_requested_or_it_holds():
-    whole = {"boundary_inputs": "private", "unit": "horizon"}
+    whole = {"preset": "capped", "boundary_inputs": "private", "unit": "horizon"}
     for privacy in ("paper", "corrected", "capped", whole):
         warn_where_void(resolve("private-highway", {"privacy": privacy}))  # would be an error here
 

@@ -32,6 +32,11 @@ def test_the_checkers_find_nothing(env_id, action):
     env.close()
 
 
+@pytest.mark.parametrize("env_id", IDS)
+def test_no_id_has_a_newer_version(env_id):
+    gym.make(env_id)  # Gymnasium's warning would be an error here
+
+
 @pytest.mark.slow
 def test_importing_the_package_and_making_environments_is_light():
     code = """

@@ -23,7 +23,7 @@ from tests.helpers import fast_and_slow
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
-IDS = {"paper": "ShortHighway-v0", "capped": "PrivateHighway-v0", "paced": "PrivateHighway-v1"}
+IDS = {"paper": "ShortHighway-v0", "capped": "PrivateHighway-v1", "paced": "PrivateHighway-v1"}
 
 
 def make_private(preset="capped", **keywords):
@@ -34,7 +34,8 @@ def make_private(preset="capped", **keywords):
         keywords: Of the environment; ``privacy`` may name a release model of another class.
     """
     keywords = {"horizon": STEPS, "random_start": True, **keywords}
-    keywords["privacy"] = {"boundary_inputs": "nominal", **keywords.get("privacy", {})}
+    privacy = {"preset": preset, "boundary_inputs": "nominal"}
+    keywords["privacy"] = privacy | keywords.get("privacy", {})
     return gym.make(f"dptse_env:dptse/{IDS[preset]}", traffic_seeds=SEEDS, **keywords)
 
 
@@ -243,7 +244,7 @@ def tell_realised_exposures(process):
 
     def mutant(episode):
         paid = process.release.ledgers.paid[episode]
-        return info(episode) | {"mu": float(paid.max(initial=0))}
+        return info(episode) | {"spent_mu": float(paid.max(initial=0))}
 
     process.info = mutant
 

@@ -5,10 +5,10 @@ import pytest
 
 from dptse_env.config import resolve
 from dptse_env.parts import make_parts
-from dptse_env.process import QueryProcess
+from dptse_env.process import QueryProcess, ResetOptions
 from dptse_env.release.noise import grid_of
 from dptse_env.traffic import RecordLibrary
-from tests.helpers import assert_same, make_env, play
+from tests.helpers import SumRelease, assert_same, make_env, play
 
 TWO = np.arange(2)
 EVERYWHERE = {"traffic_seed": 0, "start": 0}
@@ -97,3 +97,46 @@ def test_an_episode_is_scored_against_the_record_at_its_second(start):
         if reward is not None:
             np.testing.assert_allclose(reward, -error / corridor.density_scale, rtol=1e-12)
         reward = process.step(TWO, np.ones((2, 6), dtype=np.int8)).reward
+
+
+def test_traffic_noise_estimator_and_detectors_have_streams_of_their_own(monkeypatch):
+    """Four children of one seed of 128 bits, which no other episode shares."""
+    given = []
+
+    def spied(reset):
+        return lambda episodes, *rest: (given.append(rest[-1]), reset(episodes, *rest))[1]
+
+    def spied_draw(choice, generators):
+        given.append(generators)
+        return draw(choice, generators)
+
+    draw = ResetOptions.draw
+    monkeypatch.setattr(ResetOptions, "draw", spied_draw)
+    process = begin((0, 0), EVERYWHERE, detectors={"dropout": 0.1}, estimator="enkf")
+    for part in (process.detectors, process.release, process.estimator):
+        monkeypatch.setattr(part, "reset", spied(part.reset))
+    given.clear()
+    process.reset(TWO, [np.random.default_rng(seed) for seed in (1, 2)], EVERYWHERE)
+    traffic, detectors, noise, estimator = given
+    for episode in (0, 1):
+        streams = [each[episode] for each in (traffic, noise, estimator, detectors)]
+        seeds = [stream.bit_generator.seed_seq for stream in streams]
+        assert [seed.spawn_key for seed in seeds] == [(k,) for k in range(4)]
+        assert len({tuple(seed.entropy) for seed in seeds}) == 1
+        assert len(seeds[0].entropy) == 4
+        assert max(seeds[0].entropy) >= 2**30  # words of 32 bits
+    entropies = [each.bit_generator.seed_seq.entropy for each in noise]
+    assert entropies[0] != entropies[1]
+
+
+def test_secure_noise_takes_no_seed_and_has_no_forks():
+    privacy = {"preset": "paced", "noise": "secure"}
+    played = [noise(begin((1, 2), EVERYWHERE, privacy=privacy)) for _ in range(2)]
+    assert (played[0] != played[1]).mean() > 0.99
+    process = begin((1, 2), EVERYWHERE, privacy=privacy)
+    assert process.privacy()["noise"] == "secure"
+    assert "seed" not in process.privacy()["guarantee"]
+    with pytest.raises(RuntimeError, match=r"privacy\.noise is 'secure'"):
+        process.fork()
+    with pytest.raises(ValueError, match=r"^privacy\.noise must be 'seeded' with"):
+        begin((1, 2), EVERYWHERE, privacy={"preset": SumRelease, "noise": "secure"})

@@ -68,7 +68,7 @@ class FilterPlan:
         seed: Training seed: scenarios, first weights, order.
         traffic_seeds: Traffic seeds to train on.
         validation_seeds: Traffic seeds to validate on.
-        validation_envs: Environments to validate in, with their default keywords.
+        validation_envs: Environments to validate in, as ``ID`` or ``ID {JSON}``.
         ranges: Ranges that scenarios are drawn from.
         rounds: Rounds, one after the other.
         width: Width of the hidden state.
@@ -90,7 +90,7 @@ class FilterPlan:
     traffic_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
     validation_envs: tuple[str, ...] = (
-        "dptse_env:dptse/PrivateHighway-v0",
+        'dptse_env:dptse/PrivateHighway-v1 {"privacy": "capped"}',
         "dptse_env:dptse/PrivateHighway-v1",
         "dptse_env:dptse/PaperHighway-v0",
     )

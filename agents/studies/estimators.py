@@ -51,8 +51,8 @@ from agents.tables import (
 )
 from agents.watchers import JUMP, LEVELS, REGIMES, SLOW
 
-PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v0"
-PACED, SHORT = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/ShortHighway-v0"
+PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
+SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = tuple(range(2000, 2064))
 EKF, WALK, LEARNED = "ekf", "random_walk", "recurrent"
 ROUND_ROBIN = "round-robin"
@@ -64,18 +64,18 @@ EVERYONE = (*QUICK, *SLOW_FILTERS)
 POLICIES = ("paper", ROUND_ROBIN, "oldest-first", "stale-variance", "largest-deviation")
 SHIPPED = "private-highway"
 """A learned query policy for the world `CAPPED`, trained with the EKF."""
-CAPPED = "PrivateHighway-v0"
+CAPPED = "PrivateHighway-v1, capped"
 World = tuple[str, dict[str, Any]]
 """An environment and its keywords."""
 _SUMS = {"query_spans": [2], "bandwidth_unit": "sums"}
 WORLDS: dict[str, World] = {
     "PaperHighway-v0": (PAPER, {}),
     "PaperHighway-v0, corrected": (PAPER, {"privacy": "corrected"}),
-    CAPPED: (PRIVATE, {}),
-    "PrivateHighway-v1": (PACED, {}),
-    "PrivateHighway-v1, five sums": (PACED, _SUMS),
-    "PrivateHighway-v1, ε = 1": (PACED, {"epsilon": 1.0}),
-    "PrivateHighway-v1, ε = 1, five sums": (PACED, {"epsilon": 1.0, **_SUMS}),
+    CAPPED: (PRIVATE, {"privacy": "capped"}),
+    "PrivateHighway-v1": (PRIVATE, {}),
+    "PrivateHighway-v1, five sums": (PRIVATE, _SUMS),
+    "PrivateHighway-v1, ε = 1": (PRIVATE, {"epsilon": 1.0}),
+    "PrivateHighway-v1, ε = 1, five sums": (PRIVATE, {"epsilon": 1.0, **_SUMS}),
 }
 MAIN = tuple(WORLDS)[:4]
 """Worlds in which estimators meet query policies."""
@@ -102,14 +102,14 @@ _DRIVERS = {
     "headways of 2 s": {"headway": 2.0},
 }
 ELSEWHERE: dict[str, World] = {
-    **{name: (PACED, {"corridor": {"drivers": drivers}}) for name, drivers in _DRIVERS.items()},
-    "no incident": (PACED, {"incident": "none"}),
-    "the paper's incident": (PACED, {"incident": _INCIDENT}),
-    "demand with two peaks": (PACED, {"demand": OTHER_DRIVERS["demand"]}),
-    "a road of 6 km, B = 20": (PACED, {"corridor": _LONG_ROAD, "bandwidth": 20}),
+    **{name: (PRIVATE, {"corridor": {"drivers": drivers}}) for name, drivers in _DRIVERS.items()},
+    "no incident": (PRIVATE, {"incident": "none"}),
+    "the paper's incident": (PRIVATE, {"incident": _INCIDENT}),
+    "demand with two peaks": (PRIVATE, {"demand": OTHER_DRIVERS["demand"]}),
+    "a road of 6 km, B = 20": (PRIVATE, {"corridor": _LONG_ROAD, "bandwidth": 20}),
     "ShortHighway-v0": (SHORT, {}),
-    **{f"ε = {epsilon:g}": (PACED, {"epsilon": epsilon}) for epsilon in (0.5, 2.0, 10.0, 20.0)},
-    **{f"B = {bandwidth}": (PACED, {"bandwidth": bandwidth}) for bandwidth in (1, 2, 10, 15)},
+    **{f"ε = {epsilon:g}": (PRIVATE, {"epsilon": epsilon}) for epsilon in (0.5, 2.0, 10.0, 20.0)},
+    **{f"B = {bandwidth}": (PRIVATE, {"bandwidth": bandwidth}) for bandwidth in (1, 2, 10, 15)},
 }
 """Worlds that differ from PrivateHighway-v1 in one thing, and a road of its own."""
 MOVED = (EKF, WALK, LEARNED)
@@ -229,7 +229,7 @@ def sensed_cell(labels: Labels) -> Cell:
         keywords["detectors"] = {"factor": [FACTORS[fault] if bad else 1.0 for bad in at_fault]}
     if labels["estimator"] == LEARNED:  # its deviations are honest, filters do better without
         keywords["fusion"] = {"dwell_factor": 1.0}
-    return Cell(PACED, labels["policy"], keywords, labels, seeds=SENSED_SEEDS)
+    return Cell(PRIVATE, labels["policy"], keywords, labels, seeds=SENSED_SEEDS)
 
 
 SENSED_CELLS = [

@@ -55,7 +55,7 @@ from dptse_env.privacy import epsilon_of
 from dptse_env.release import Paced, Pacing, ReleaseModel, Task, Traffic
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
-ENV = "dptse_env:dptse/PrivateHighway-v0"
+ENV = "dptse_env:dptse/PrivateHighway-v1"
 SEEDS = tuple(range(2000, 2020))
 DELTA, STRICT, CAP = 0.05, 0.001, 64
 

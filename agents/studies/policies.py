@@ -76,7 +76,7 @@ Statistic = Callable[..., FloatArray]
 
 # What is played: nine settings, first on validation traffic, then on test traffic.
 
-PRIVATE = "dptse_env:dptse/PrivateHighway-v0"
+PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
 PRIMARY = "primary"
 
 
@@ -89,19 +89,20 @@ class Setting(NamedTuple):
 
 
 _EKF_5 = {"estimator": "ekf", "bandwidth": 5}
+_CAPPED_5 = {**_EKF_5, "privacy": "capped"}
 _INCIDENT: Any = CORRIDORS["paper-highway"].incident
 SETTINGS = {
-    PRIMARY: Setting("PrivateHighway, EKF, B = 5", _EKF_5),
+    PRIMARY: Setting("PrivateHighway, EKF, B = 5", _CAPPED_5),
     "paper": Setting("PaperHighway, EKF, B = 5", _EKF_5, "dptse_env:dptse/PaperHighway-v0"),
-    "bandwidth-3": Setting("B = 3", {**_EKF_5, "bandwidth": 3}),
-    "bandwidth-7": Setting("B = 7", {**_EKF_5, "bandwidth": 7}),
-    "ukf": Setting("UKF", {**_EKF_5, "estimator": "ukf"}),
-    "mhe": Setting("MHE", {**_EKF_5, "estimator": "mhe"}),
-    "epsilon-1": Setting("ε = 1", {**_EKF_5, "epsilon": 1.0}),
-    "epsilon-10": Setting("ε = 10", {**_EKF_5, "epsilon": 10.0}),
+    "bandwidth-3": Setting("B = 3", {**_CAPPED_5, "bandwidth": 3}),
+    "bandwidth-7": Setting("B = 7", {**_CAPPED_5, "bandwidth": 7}),
+    "ukf": Setting("UKF", {**_CAPPED_5, "estimator": "ukf"}),
+    "mhe": Setting("MHE", {**_CAPPED_5, "estimator": "mhe"}),
+    "epsilon-1": Setting("ε = 1", {**_CAPPED_5, "epsilon": 1.0}),
+    "epsilon-10": Setting("ε = 10", {**_CAPPED_5, "epsilon": 10.0}),
     "paper-incident": Setting(
         "the paper's incident in place of random ones",
-        {**_EKF_5, "incident": dataclasses.asdict(_INCIDENT)},
+        {**_CAPPED_5, "incident": dataclasses.asdict(_INCIDENT)},
     ),
 }
 REFERENCE, ROUND_ROBIN, ORACLE, GAIN = "paper", "round-robin", "oracle-error", "oracle-gain"
@@ -274,12 +275,7 @@ CAPPED, PACED = "capped", "paced"
 EKF, RECURRENT = "ekf", "recurrent"
 HIGHWAY, LONG = "highway", "long"
 OWN_TRAFFIC, OTHER_TRAFFIC = "own", "krauss-two-peaks"
-ENVS = {
-    (HIGHWAY, CAPPED): PRIVATE,
-    (HIGHWAY, PACED): "dptse_env:dptse/PrivateHighway-v1",
-    (LONG, CAPPED): "dptse_env:dptse/LongHighway-v0",
-    (LONG, PACED): "dptse_env:dptse/LongHighway-v0",
-}
+ENVS = {HIGHWAY: PRIVATE, LONG: "dptse_env:dptse/LongHighway-v0"}
 TRAFFIC: dict[str, dict[str, Any]] = {OWN_TRAFFIC: {}, OTHER_TRAFFIC: OTHER_DRIVERS}
 N_SEGMENTS = {HIGHWAY: 15, LONG: 120}
 ROADS = {HIGHWAY: "1.5 km, 15 segments", LONG: "12 km, 120 segments"}
@@ -368,16 +364,15 @@ def choice_cells(trained: Sequence[Trained]) -> Iterator[Cell]:
 def _choice_cell(world: World, bandwidth: int, name: str, policy: str, seed: int = -1) -> Cell:
     keywords = {
         **TRAFFIC[world.traffic],
+        "privacy": world.release,
         "estimator": world.estimator,
         "epsilon": world.epsilon,
         "bandwidth": bandwidth,
     }
-    if world.road == LONG:
-        keywords["privacy"] = world.release
     if world.span > 1:
         keywords |= {"query_spans": [world.span], "bandwidth_unit": "sums"}
     return Cell(
-        env=ENVS[world.road, world.release],
+        env=ENVS[world.road],
         policy=policy,
         keywords=keywords,
         labels={**at(world, bandwidth, name), "training_seed": seed},

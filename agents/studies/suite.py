@@ -42,9 +42,8 @@ from dptse_env.parts import privacy_report
 NAME = "query-suite-v2"
 """Changes with anything that a score depends on."""
 
-PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v0"
-PACED, SHORT = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/ShortHighway-v0"
-LONG = "dptse_env:dptse/LongHighway-v0"
+PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
+LONG, SHORT = "dptse_env:dptse/LongHighway-v0", "dptse_env:dptse/ShortHighway-v0"
 ZERO, ONE = "paper", "oracle-error"
 """Schedules of the scores 0 and 1."""
 
@@ -90,14 +89,20 @@ def _task(name: str, meaning: str, env: str, estimator: str, bandwidth: int, **m
 
 TASKS = (
     _task("paper", "PaperHighway-v0, noise as printed, EKF, B = 5", PAPER, "ekf", 5),
-    _task("capped-ekf-5", "PrivateHighway-v0, EKF, B = 5", PRIVATE, "ekf", 5),
-    _task("capped-recurrent-5", "PrivateHighway-v0, recurrent, B = 5", PRIVATE, "recurrent", 5),
-    _task("paced-ekf-2", "PrivateHighway-v1, EKF, B = 2", PACED, "ekf", 2),
-    _task("paced-recurrent-2", "PrivateHighway-v1, recurrent, B = 2", PACED, "recurrent", 2),
-    _task("paced-recurrent-5", "PrivateHighway-v1, recurrent, B = 5", PACED, "recurrent", 5),
+    _task(
+        "capped-ekf-5", "PrivateHighway-v1, capped, EKF, B = 5", PRIVATE, "ekf", 5,
+        privacy="capped",
+    ),
+    _task(
+        "capped-recurrent-5", "PrivateHighway-v1, capped, recurrent, B = 5", PRIVATE,
+        "recurrent", 5, privacy="capped",
+    ),
+    _task("paced-ekf-2", "PrivateHighway-v1, EKF, B = 2", PRIVATE, "ekf", 2),
+    _task("paced-recurrent-2", "PrivateHighway-v1, recurrent, B = 2", PRIVATE, "recurrent", 2),
+    _task("paced-recurrent-5", "PrivateHighway-v1, recurrent, B = 5", PRIVATE, "recurrent", 5),
     _task(
         "other-drivers", "paced-recurrent-2 with drivers by Krauss and two peaks of demand",
-        PACED, "recurrent", 2, **OTHER_DRIVERS,
+        PRIVATE, "recurrent", 2, **OTHER_DRIVERS,
     ),
     _task(
         "short", "ShortHighway-v0, paced, recurrent, B = 1", SHORT, "recurrent", 1,
@@ -113,7 +118,7 @@ TASKS = (
     _task(
         "connected-recurrent-5",
         "paced-recurrent-5 with one vehicle in ten connected, and detectors on segments 3, 7, 11",
-        PACED, "recurrent", 5, penetration=0.1, corridor={"fixed_sensors": [3, 7, 11]},
+        PRIVATE, "recurrent", 5, penetration=0.1, corridor={"fixed_sensors": [3, 7, 11]},
     ),
 )  # fmt: skip
 

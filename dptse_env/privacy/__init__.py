@@ -1,14 +1,19 @@
 """Differential privacy, mathematics only: Gaussian relations, sensitivities, noise, accounts."""
 
 from dptse_env.privacy.gaussian import (
+    DELTAS,
+    ROUNDING,
     EpsilonTable,
     ReleaseAccount,
     delta_of,
     epsilon_of,
+    epsilons_of,
     joint_noise_std,
     le_ny_kappa,
     mu_of,
+    over_trips,
     printed_noise_std,
+    require_covered,
     single_noise_std,
 )
 from dptse_env.privacy.sensitivity import (
@@ -20,6 +25,8 @@ from dptse_env.privacy.sensitivity import (
 )
 
 __all__ = [
+    "DELTAS",
+    "ROUNDING",
     "Adjacency",
     "EpsilonTable",
     "ReleaseAccount",
@@ -28,10 +35,13 @@ __all__ = [
     "contribution_sensitivity",
     "delta_of",
     "epsilon_of",
+    "epsilons_of",
     "joint_noise_std",
     "le_ny_kappa",
     "mu_of",
+    "over_trips",
     "paper_sensitivity",
     "printed_noise_std",
+    "require_covered",
     "single_noise_std",
 ]

@@ -20,12 +20,13 @@ from dptse_env.estimators import Estimate, Measurement
 from dptse_env.model import MeasurementRows
 from dptse_env.model.network import covered
 from dptse_env.privacy import Adjacency
+from dptse_env.release.noise import NoiseSource
 from dptse_env.release.queries import QueryOptions
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.vehicles import Traffic
 from dptse_env.traffic import Corridor, Penetration
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.fields import Interval, checked_fields, require
 from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.vector_info import Rows
 
@@ -34,7 +35,7 @@ BoundaryInputs = Literal["true", "nominal", "private"]
 boundary segments' releases."""
 
 CHANGES: dict[Adjacency, str] = {
-    "replace": "replaced by another",
+    "replace": "replaced by any other, connected or not, or by none",
     "add_remove": "added or removed",
 }
 """Change of a vehicle's data between two adjacent records, in words."""
@@ -51,6 +52,9 @@ class PrivacySettings:
         delta: Privacy parameter delta.
         boundary_inputs: Source of the estimator's inputs at the boundary: ``true``, ``nominal`` or
             ``private``; None for the model's default.
+        noise: Source of the noise: ``seeded``, the episode's stream, for simulation, or ``secure``,
+            the operating system's randomness, which nobody can repeat. Both have exactly the same
+            distribution. A process with secure noise has no forks, whose releases would share it.
 
     Raises:
         ValueError: A field is out of range; the message names its path below ``privacy``.
@@ -62,6 +66,7 @@ class PrivacySettings:
     epsilon: Annotated[float, Interval(1e-4, 1e4)] = 1.0
     delta: Annotated[float, Interval(1e-12, 0.5, open_high=True)] = 0.05
     boundary_inputs: BoundaryInputs | None = None
+    noise: NoiseSource = "seeded"
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -72,11 +77,13 @@ class PrivacySettings:
         """Source of the estimator's inputs at the boundary."""
         return self.boundary_inputs or self.default_boundary
 
-    def guarantee(self, quantities: str, protected: str) -> str:
-        """Return the sentence that states (epsilon, delta) for quantities and what is protected."""
+    def guarantee(self, mu: float, quantities: str, protected: str) -> str:
+        """Return the sentence that states mu and (epsilon, delta), and what is protected."""
+        against = "" if self.noise == "secure" else ", against whoever does not know the seed"
         return (
-            f"({self.epsilon:g}, {self.delta:g})-differential privacy of {quantities} together, "
-            f"for {protected}"
+            f"{math.ceil(1e4 * mu) / 1e4:g}-Gaussian differential privacy, which is "
+            f"({self.epsilon:g}, {self.delta:g})-differential privacy, of {quantities} together, "
+            f"for {protected}{against}"
         )
 
 
@@ -116,7 +123,8 @@ class Task:
             first and all others the second.
 
     Raises:
-        ValueError: Groups see other vehicles, or there are two, and the model knows of none.
+        ValueError: Groups see other vehicles, or there are two, and the model knows of none; or
+            its noise cannot be secure.
     """
 
     name: str
@@ -129,12 +137,15 @@ class Task:
     groups: tuple[Group, ...] = (Group("queries"),)
 
     def __post_init__(self) -> None:
-        """Check that the release model can serve the groups."""
+        """Check that the release model can serve the groups, and has the noise."""
         if not (self.is_whole or self.model.knows_groups):
             raise ValueError(
                 f"penetration.share must be 1, and detectors left out, with the release model "
                 f"{self.name!r}, which knows of no groups of columns"
             )
+        has_noise = self.settings.noise == "seeded" or self.model.takes_noise
+        only = f"'seeded' with the release model {self.name!r}, whose noise is its own"
+        require(has_noise, "privacy.noise", only, self.settings.noise)
 
     @property
     def is_whole(self) -> bool:
@@ -351,7 +362,8 @@ class ReleaseModel(ABC):
     """True where each column shows what its group sees, and spends its group's part of the
     budget."""
     takes_noise: ClassVar[bool] = False
-    """True where `give_noise` works, which trainings by swaps need."""
+    """True where noise is a `dptse_env.release.noise.Noise`, which `give_noise` sets for trainings
+    by swaps, and which may be secure."""
 
     @classmethod
     def flow_centre(cls, corridor: Corridor, settings: Any) -> float | None:
@@ -405,7 +417,8 @@ class ReleaseModel(ABC):
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return upper bounds on a vehicle's privacy loss so far, mu and epsilon, shape (k,) each.
 
-        They are public, and infinite if unknown.
+        They are public, and infinite if unknown. They read like an odometer; what is guaranteed is
+        the budget, in the report.
 
         Args:
             episodes: Distinct rows of the batch, shape (k,).
@@ -426,6 +439,7 @@ class ReleaseModel(ABC):
             claimed_delta=settings.delta,
             speed_release="flow" if task.releases_flow else "mean",
             boundary_inputs=settings.boundary,
+            noise=settings.noise,
         )
 
     def public(self, episodes: IntArray) -> Rows:

@@ -12,11 +12,13 @@ import numpy as np
 
 from dptse_env.estimators import Measurement
 from dptse_env.privacy import (
+    ROUNDING,
     Adjacency,
     ReleaseAccount,
     Sensitivity,
     contribution_sensitivity,
     epsilon_of,
+    epsilons_of,
     joint_noise_std,
     paper_sensitivity,
     printed_noise_std,
@@ -31,8 +33,8 @@ from dptse_env.release.base import (
     Task,
 )
 from dptse_env.release.noise import Noise
-from dptse_env.release.report import STRICT_DELTA, PrivacyReport, QuantityReport, in_order
-from dptse_env.release.vehicles import Ledgers, Traffic
+from dptse_env.release.report import PrivacyReport, QuantityReport, in_order
+from dptse_env.release.vehicles import Ledgers, Traffic, require_exact_sums
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.fields import Interval
@@ -48,14 +50,17 @@ SpeedRelease = Literal["mean", "flow"]
 class GaussianRelease(ReleaseModel):
     """Release of true values plus Gaussian noise; subclasses define values and sensitivity.
 
-    Sensitivity and noise are those of the shortest segment. One vehicle changes the sums of a
+    Sensitivity and noise are those of the shortest segment. One vehicle changes the density of a
     longer one by less, in proportion to its length, and its noise is smaller by as much: a vehicle
-    counts alike on every segment, in units of the noise.
+    counts alike on every segment, in units of the noise. Where flows are released, noise is added
+    to the sums of vehicles and of their deviations, before these are divided by the length.
 
     Attributes:
         sensitivity: L2 sensitivities of both released quantities over an episode, by group.
         noise_std: Standard deviations of the noise of both, shape (groups, 2).
-        mu: Parameter of Gaussian differential privacy of each group, shape (groups,).
+        added_std: Those of the noise that is added to `true_values`, shape (n, C, 2).
+        unit: What these are divided by, shape (C,).
+        mu: Parameter of Gaussian differential privacy of each group, rounded up, shape (groups,).
         ledgers: Contributions of the vehicles so far.
         noise: Standard normal noise.
     """
@@ -69,21 +74,26 @@ class GaussianRelease(ReleaseModel):
         n, groups = task.n_episodes, range(len(task.groups))
         self.sensitivity = tuple(self._sensitivity(group) for group in groups)
         self.noise_std: FloatArray = np.array([self._noise_std(group) for group in groups])
-        self.mu: FloatArray = np.array(
+        self.mu: FloatArray = (1.0 + ROUNDING) * np.array(
             [self.sensitivity[group].joint_mu(self.noise_std[group].tolist()) for group in groups]
         )
         self._account = ReleaseAccount(
             math.hypot(*self.mu), task.settings.delta, self.sensitivity[0].contributions
         )
-        self._stretch = task.length / min(task.corridor.segment_lengths)
-        self._is_even = bool((self._stretch == 1.0).all())
-        self._sigma = np.tile(self.noise_std[task.group], (n, 1, 1))
-        self._released_sigma = self._sigma / self._stretch[:, None]
+        shortest = min(task.corridor.segment_lengths)
+        sigma = np.tile(self.noise_std[task.group], (n, 1, 1))
+        if task.releases_flow:
+            self.unit, self.added_std = task.length, sigma * shortest
+        else:
+            self.unit, self.added_std = task.length / shortest, sigma
+        self._released_sigma = self.added_std / self.unit[:, None]
         v_0 = math.nan if task.flow_centre is None else task.flow_centre
         self._centre = np.full((n, task.n_places), v_0)
         self._price, self._zero = np.ones((n, task.n_columns)), np.zeros((n, task.n_places))
-        self.noise = Noise(n, task.n_columns)
+        self.noise = Noise(n, task.n_columns, task.settings.noise)
         self.ledgers = self._ledgers()
+        if task.releases_flow:
+            require_exact_sums(self.added_std[0].min(axis=0), self.ledgers.clip)
 
     def _ledgers(self) -> Ledgers:
         """Return ledgers of the vehicles, by which they may count without end."""
@@ -105,9 +115,11 @@ class GaussianRelease(ReleaseModel):
 
     @abstractmethod
     def true_values(self, request: Request) -> FloatArray:
-        """Return what is released before noise is added, shape (k, C, 2).
+        """Return what noise is added to, shape (k, C, 2).
 
-        Where contributions are bounded, those of the observed columns are charged.
+        Sums over vehicles where flows are released, else means times the length of a column over
+        that of the shortest segment. Where contributions are bounded, those of the observed columns
+        are charged.
         """
 
     @property
@@ -129,30 +141,28 @@ class GaussianRelease(ReleaseModel):
     def release(self, request: Request) -> Measurement:
         """See `ReleaseModel.release`."""
         values = self.true_values(request)
-        if not self._is_even:
-            values = values * self._stretch[:, None]
         k = len(values)
-        values = self.noise.added(request.episodes, values, self._sigma[:k], self._stretch)
+        values = self.noise.added(request.episodes, values, self.added_std[:k], self.unit)
         return Measurement(request.observed, values, self._released_sigma[:k], self._centre[:k])
 
     def mean_values(self, request: Request) -> FloatArray:
-        """Return densities and mean speeds of the vehicles that count, shape (k, C, 2).
+        """Return `true_values` of densities and mean speeds of the vehicles that count.
 
         Without any of them the speed limit is the mean; unobserved columns hold these, too.
         """
         task = self.task
-        sums = self._sums(request, self._zero)
+        sums = self.sums(request, self._zero)
         counts = sums[..., 0].copy()
         sums[..., 0] /= task.length
         sums[..., 1] = np.where(counts == 0.0, task.limit, sums[..., 1] / np.maximum(counts, 1.0))
+        sums *= self.unit[:, None]
         return sums
 
-    def _sums(self, request: Request, centre: FloatArray) -> FloatArray:
+    def sums(self, request: Request, centre: FloatArray) -> FloatArray:
         """Return the sums of the vehicles that count, and of their speeds from a centre."""
-        k, rows = len(request.episodes), self.traffic.vehicles(request.traffic, request.times)
-        sums, _ = self.ledgers.collect(
-            request.episodes, request.observed, rows, self._price[:k], centre[:k]
-        )
+        rows, k = self.traffic.vehicles(request.traffic, request.times), len(request.episodes)
+        public = self._price[:k], centre[:k], self.added_std[:k]
+        sums, _ = self.ledgers.collect(request.episodes, request.observed, rows, *public)
         return sums
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -176,12 +186,12 @@ class GaussianRelease(ReleaseModel):
         quantities = " and ".join(release.quantity for release in sensitivity.releases)
         return replace(
             super().report(),
-            guarantee="none" if found else settings.guarantee(quantities, protects),
+            guarantee="none" if found else settings.guarantee(mu, quantities, protects),
             void_reasons=in_order(found),
             protects=protects,
             mu=mu,
             epsilon=epsilon,
-            epsilon_strict=epsilon_of(mu, STRICT_DELTA),
+            epsilons=epsilons_of(mu),
             releases=tuple(
                 QuantityReport(item.quantity, item.unit, item.bound, std, item.bound / std)
                 for item, std in zip(sensitivity.releases, self.sigma.tolist(), strict=True)
@@ -249,7 +259,7 @@ class Paper(GaussianRelease):
         if not task.is_whole:
             return self.mean_values(request)
         values = self.traffic.aggregates(request.traffic, request.times, task.n_places)
-        return values[:, self._places]
+        return values[:, self._places] * self.unit[:, None]
 
 
 class Corrected(Paper):
@@ -312,7 +322,7 @@ class CappedSettings(PrivacySettings):
         """Description of the protected data and of the change that is protected."""
         change = CHANGES[self.adjacency]
         return {
-            "trip": f"one vehicle's trip, {change}, which counts in {self.cap} queried steps",
+            "trip": f"one vehicle's trip, which counts in {self.cap} queried steps, {change}",
             "horizon": f"one vehicle's whole trip, {change}",
             "event": f"one second of one vehicle's trip, {change}",
         }[self.unit]
@@ -323,7 +333,7 @@ class Capped(GaussianRelease):
 
     The guarantee holds for any query policy. The centred flow [veh/h] is the sum of v - v_0 over
     the vehicles that count, per length, with v clipped to [0, 2 v_0]: it changes by at most v_0 / l
-    when a vehicle comes or goes. ``docs/privacy.md`` has the proof. A vehicle's ledger has a budget
+    when a vehicle comes or goes. ``docs/proof.md`` has the proof. A vehicle's ledger has a budget
     of C contributions at a price of 1 each, in each group of columns.
     """
 
@@ -340,8 +350,9 @@ class Capped(GaussianRelease):
         """Return ledgers by which a vehicle counts as often as the cap allows in each group."""
         task, cap = self.task, self.task.settings.contribution_cap
         budget = np.full(len(task.groups), math.inf if cap is None else float(cap))
+        clip = math.inf if task.flow_centre is None else task.flow_centre
         fastest = task.corridor.largest_speed_limit
-        return Ledgers(task.columns, task.n_episodes, budget, fastest=fastest)
+        return Ledgers(task.columns, task.n_episodes, budget, clip=clip, fastest=fastest)
 
     def _sensitivity(self, group: int) -> Sensitivity:
         corridor, settings = self.task.corridor, self.task.settings
@@ -357,7 +368,8 @@ class Capped(GaussianRelease):
     def _noise_std(self, group: int) -> tuple[float, ...]:
         settings, sensitivity = self.task.settings, self.sensitivity[group]
         noise = joint_noise_std(sensitivity, settings.epsilon, settings.delta, settings.share)
-        return tuple(std / math.sqrt(self.task.shares[group]) for std in noise)
+        factor = (1.0 + ROUNDING) / math.sqrt(self.task.shares[group])
+        return tuple(factor * std for std in noise)
 
     def _void_reasons(self) -> tuple[str, ...]:
         return ("speed_sensitivity",) if self.task.settings.speed_release == "mean" else ()
@@ -379,9 +391,7 @@ class Capped(GaussianRelease):
         """See `GaussianRelease.true_values`; unobserved columns hold zeros."""
         if not self.task.releases_flow:
             return self.mean_values(request)
-        sums = self._sums(request, self._centre)
-        sums /= self.task.length[:, None]
-        return sums
+        return self.sums(request, self._centre)
 
     def budgets_spent(self, episodes: IntArray) -> FloatArray:
         """See `ReleaseModel.budgets_spent`: contributions over their cap, by shares of groups."""
@@ -399,7 +409,7 @@ class Capped(GaussianRelease):
         """
         counted = self.ledgers.of(episodes, self.traffic.n_vehicles[traffic])
         # A vehicle that has counted k times has spent the budget of a cap of k.
-        cap = self._account.contributions or 1
+        cap = self.task.settings.contributions(self.task.horizon)
         spent = [self._account.epsilons(self.mu**2 @ steps / cap) for steps in counted]
         rows: Rows = {
             f"{prefix}exposures": object_array([steps[g].astype(int).tolist() for steps in counted])

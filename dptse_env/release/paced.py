@@ -11,7 +11,15 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from dptse_env.estimators import Measurement
-from dptse_env.privacy import Adjacency, EpsilonTable, epsilon_of, mu_of
+from dptse_env.privacy import (
+    ROUNDING,
+    Adjacency,
+    EpsilonTable,
+    epsilon_of,
+    epsilons_of,
+    mu_of,
+    require_covered,
+)
 from dptse_env.release.base import (
     CHANGES,
     BoundaryInputs,
@@ -22,18 +30,14 @@ from dptse_env.release.base import (
 )
 from dptse_env.release.noise import Noise
 from dptse_env.release.pacing import PACINGS, EventPacing, check_prices
-from dptse_env.release.report import STRICT_DELTA, PrivacyReport
-from dptse_env.release.vehicles import Ledgers, Traffic
+from dptse_env.release.report import PrivacyReport
+from dptse_env.release.vehicles import Ledgers, Traffic, require_exact_sums
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval
 from dptse_env.utils.kernels import Bundle, kernel
 from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.vector_info import Rows, object_array
-
-ROUNDING = 1e-9
-"""Part of the budget that is kept back for rounding errors of ledgers."""
-
 
 PacedUnit = Literal["trip", "event"]
 """Unit of protection of the paced ledger: a complete trip, or a second of it."""
@@ -95,11 +99,11 @@ class Paced(ReleaseModel):
     (`dptse_env.release.pacing`). With mu the parameter of the guarantee of a group of columns, a
     vehicle has a budget of mu^2 / 2 there against its replacement by another, and of mu^2 against
     being added or removed; the mu^2 of the groups add up to that of all releases. The guarantee
-    holds for any query policy, any estimator and any pacing: ``docs/privacy.md`` has the proof.
+    holds for any query policy, any estimator and any pacing: ``docs/proof.md`` has the proof.
 
     Attributes:
         mu: Parameter of Gaussian differential privacy of each group, shape (groups,).
-        budget: Budget of a vehicle in each group, a part of which ledgers keep back for rounding.
+        budget: Budget of a vehicle in each group, of which ledgers keep back `ROUNDING`.
         ledgers: Charges that the vehicles have paid.
         pacing: Rule that sets the prices.
         noise: Standard normal noise.
@@ -141,7 +145,7 @@ class Paced(ReleaseModel):
         # A pacing that offers the whole budget at once stays below what ledgers hold back.
         self.pacing = pacing(task, (1.0 - 2.0 * ROUNDING) * self.budget)
         self._checks_prices = is_foreign(self.pacing)
-        self.noise = Noise(n, task.n_columns)
+        self.noise = Noise(n, task.n_columns, settings.noise)
         self.prices = np.zeros((n, task.n_columns))
         # The largest payments that a vehicle can have made in each group.
         self._charged = np.zeros((n, len(task.groups)))
@@ -152,6 +156,10 @@ class Paced(ReleaseModel):
             )
         )  # fmt: skip
         self._flow_noise = settings.clip / math.sqrt(settings.ratio)
+        require_covered(task.horizon * int(task.covers.sum(axis=0).max()))
+        # No vehicle pays a price above its budget.
+        least = 1.0 / math.sqrt(self.budget.max())
+        require_exact_sums(np.array([least, self._flow_noise * least]), settings.clip)
         self._limits = np.array(task.corridor.speed_limits)
         n_boundaries = task.n_places - task.corridor.n_segments
         self._neighbours = np.array(task.corridor.boundary_neighbours)[:n_boundaries]
@@ -190,7 +198,7 @@ class Paced(ReleaseModel):
             prices = check_prices(prices, observed.shape)
         sigma = np.empty((*prices.shape, 2))
         _charge(self._accounts, episodes, observed, prices, self._flow_noise, sigma)
-        sums, self._refused[episodes] = self.collect(request, prices, centre)
+        sums, self._refused[episodes] = self.collect(request, prices, centre, sigma)
         values = self.noise.added(episodes, sums, sigma, task.length)
         sigma /= task.length[:, None]
         return Measurement(observed, values, sigma, centre)
@@ -212,13 +220,13 @@ class Paced(ReleaseModel):
         return predicted, centre
 
     def collect(
-        self, request: Request, prices: FloatArray, centre: FloatArray
+        self, request: Request, prices: FloatArray, centre: FloatArray, sigma: FloatArray
     ) -> tuple[FloatArray, IntArray]:
         """Charge the vehicles of a second; return its true sums and refusals, see `Ledgers`."""
         if self.task.settings.unit == "event":  # every second has a budget of its own
             self.ledgers.reset(request.episodes)
         rows = self.traffic.vehicles(request.traffic, request.times)
-        return self.ledgers.collect(request.episodes, request.observed, rows, prices, centre)
+        return self.ledgers.collect(request.episodes, request.observed, rows, prices, centre, sigma)
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `ReleaseModel.spent`.
@@ -230,7 +238,7 @@ class Paced(ReleaseModel):
 
     def _losses(self, paid: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mu and epsilon of vehicles that have paid at most (vehicles, groups)."""
-        squares = np.minimum(self._squares * paid, self._whole)
+        squares = np.minimum((1.0 + ROUNDING) * self._squares * paid, self._whole)
         return self._epsilons.bounds(np.sqrt(squares.sum(axis=1)))
 
     def report(self) -> PrivacyReport:
@@ -239,12 +247,12 @@ class Paced(ReleaseModel):
         protects = task.protects(settings.protected)
         return replace(
             super().report(),
-            guarantee=settings.guarantee("count and flow", protects),
+            guarantee=settings.guarantee(mu, "count and flow", protects),
             void_reasons=(),
             protects=protects,
             mu=mu,
             epsilon=epsilon_of(mu, settings.delta),
-            epsilon_strict=epsilon_of(mu, STRICT_DELTA),
+            epsilons=epsilons_of(mu),
             assumptions={"budget": float(self.budget[0])},
             details={
                 "unit": settings.unit,

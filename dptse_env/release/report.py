@@ -38,9 +38,6 @@ VOID_REASONS: Mapping[str, str] = MappingProxyType(
 )
 """Reasons against a guarantee with an explanation each, in the order of reports."""
 
-STRICT_DELTA = 1e-4
-"""A delta at which epsilon is also reported, since the configured one is often weak."""
-
 
 @dataclass(frozen=True)
 class QuantityReport:
@@ -65,7 +62,7 @@ class QuantityReport:
 class PrivacyReport:
     """Public account of the release model in force; nothing in it depends on an episode's traffic.
 
-    `mu`, `epsilon` and `epsilon_strict` are the privacy loss of all releases of an episode together
+    `mu`, `epsilon` and `epsilons` are the privacy loss of all releases of an episode together
     *if the sensitivities hold*, and if only the releases are used. They are no guarantee while
     `void_reasons` has an entry.
 
@@ -78,13 +75,15 @@ class PrivacyReport:
         claimed_delta: The configured delta.
         speed_release: Release of speeds: ``mean`` or ``flow``.
         boundary_inputs: Source of the estimator's inputs at the boundary.
-        mu: Parameter of all releases together.
+        noise: Source of the noise, ``seeded`` or ``secure``. Whoever knows the seed of an episode
+            knows its noise: seeded episodes illustrate a guarantee and do not give it.
+        mu: Parameter of Gaussian differential privacy of all releases together: the budget of an
+            episode, whatever ``info["spent_mu"]`` has come to.
         epsilon: Epsilon of all releases together, at `claimed_delta`.
-        epsilon_strict: Epsilon of all releases together, at `strict_delta`.
+        epsilons: Epsilon of all releases together at further deltas, from ``"1e-2"`` to ``"1e-6"``.
         releases: A report for each released quantity.
         assumptions: The public numbers the sensitivities were computed from, by name with unit.
         details: Settings of this release model alone, such as unit, cap, adjacency and share.
-        strict_delta: The smaller delta at which `epsilon_strict` is given.
     """
 
     preset: str
@@ -95,13 +94,13 @@ class PrivacyReport:
     claimed_delta: float
     speed_release: str
     boundary_inputs: str
+    noise: str
     mu: float = math.inf
     epsilon: float = math.inf
-    epsilon_strict: float = math.inf
+    epsilons: Mapping[str, float] = field(default_factory=dict)
     releases: tuple[QuantityReport, ...] = ()
     assumptions: Mapping[str, float] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
-    strict_delta: float = STRICT_DELTA
 
     def voided(self, reasons: Iterable[str]) -> PrivacyReport:
         """Return the report with further reasons against a guarantee."""

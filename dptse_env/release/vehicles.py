@@ -1,12 +1,15 @@
 """The true traffic in memory, and what vehicles contribute to the sums of a release.
 
 A vehicle on an observed column contributes (1, d) to its sums, with d its speed less the centre of
-its place, clipped to [-D, D], and pays ``a (1 + r d^2 / D^2)`` for it, with the price a of the
-column and the ratio r. It has a ledger for each group of columns, and contributes if that covers
-the charge; otherwise it neither contributes nor pays. Whether it does depends on its own trip and
-on public numbers, never on other vehicles: removing one from a record does not change the
-contributions of the others. A price of 1, a ratio of 0 and a budget of C is a cap: a vehicle counts
-in its first C observed steps.
+its place, clipped to [-D, D] and rounded to the grid of the column's noise, and pays
+``a (1 + r d^2 / D^2)`` for it, with the price a of the column and the ratio r. Sums of integers are
+exact in any order, so that other vehicles cancel exactly between two records.
+
+A vehicle has a ledger for each group of columns, and contributes if that covers the charge;
+otherwise it neither contributes nor pays. Whether it does depends on its own trip and on public
+numbers, never on other vehicles: removing one from a record does not change the contributions of
+the others. A price of 1, a ratio of 0 and a budget of C is a cap: a vehicle counts in its first C
+observed steps.
 """
 
 from __future__ import annotations
@@ -19,9 +22,14 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
+from dptse_env.release.noise import grid_of
 from dptse_env.traffic import Corridor, Penetration, Record, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.fields import require
 from dptse_env.utils.kernels import kernel
+
+MOST_VEHICLES = 2**20
+"""Largest number of vehicles of a record whose sums are exact, see `require_exact_sums`."""
 
 GROWTH = 1.5
 """Factor on the size of full tables."""
@@ -93,7 +101,7 @@ class Traffic:
         Records that are missing on disk are made, on all cores where there are several.
 
         Raises:
-            ValueError: A record is a measured field, and vehicles are read.
+            ValueError: A record is a measured field, and vehicles are read, or it has too many.
         """
         new = [index for index in np.unique(indices).tolist() if not self._loaded[index]]
         if len(new) > 1:
@@ -140,6 +148,10 @@ class Traffic:
     def _append(self, index: int, record: Record) -> None:
         """Append the vehicles of a record, with what each group sees of them."""
         record = record.vehicles_for("the release model, or the keyword penetration,")
+        require(
+            record.n_vehicles <= MOST_VEHICLES, f"the record of traffic seed {self.seeds[index]}",
+            f"of at most {MOST_VEHICLES} vehicles", record.n_vehicles,
+        )  # fmt: skip
         end = self._n_rows + record.n_rows
         if end > self._vehicle.size:
             size = max(end, int(GROWTH * self._vehicle.size))
@@ -216,6 +228,7 @@ class Ledgers:
         rows: VehicleRows,
         prices: FloatArray,
         centre: FloatArray,
+        sigma: FloatArray,
     ) -> tuple[FloatArray, IntArray]:
         """Sum the contributions of a second to the observed columns, and charge the vehicles.
 
@@ -225,17 +238,19 @@ class Ledgers:
             rows: The vehicles of the second.
             prices: Price a of each column, shape (k, C).
             centre: Centre at each place [km/h], shape (k, S + R).
+            sigma: Standard deviations of the noise of both sums, shape (k, C, 2).
 
         Returns:
-            The sums of vehicles and of their d [km/h], shape (k, C, 2), zero where not observed,
-            and the contributions that ledgers did not cover, shape (k, groups).
+            The sums of vehicles and of their d [km/h], shape (k, C, 2), exact multiples of the grid
+            of the noise and zero where not observed; and the contributions that ledgers did not
+            cover, shape (k, groups).
         """
-        sums = np.zeros((*observed.shape, 2))
+        sums = np.empty((*observed.shape, 2))
         refused = np.zeros((len(sums), self.budget.size), dtype=np.int64)
         _collect(
             *self._columns, rows.start, rows.stop, rows.vehicle, rows.place, rows.speed,
-            episodes, observed, prices, centre, self.fastest, self.clip, self.ratio, self.budget,
-            self.paid, sums, refused,
+            episodes, observed, prices, centre, sigma, self.fastest, self.clip, self.ratio,
+            self.budget, self.paid, sums, refused,
         )  # fmt: skip
         return sums, refused
 
@@ -259,6 +274,7 @@ def _collect(
     observed: BoolArray,
     prices: FloatArray,
     centre: FloatArray,
+    sigma: FloatArray,
     fastest: Any,
     clip: float,
     ratio: float,
@@ -270,9 +286,14 @@ def _collect(
     n_columns, n_places = first.size, centre.shape[1]
     n_covering = np.empty(n_places, dtype=np.int64)
     covering = np.empty((n_places, n_columns), dtype=np.int64)
+    counts, deviations = np.empty(n_columns, dtype=np.int64), np.empty(n_columns, dtype=np.int64)
+    grid = np.empty(n_columns)
     for k in range(episodes.size):
         n_covering[:] = 0
+        counts[:] = 0
+        deviations[:] = 0
         for c in range(n_columns):
+            grid[c] = grid_of(sigma[k, c, 1])
             if observed[k, c]:
                 for s in range(first[c], first[c] + span[c]):
                     covering[s, n_covering[s]] = c
@@ -287,11 +308,38 @@ def _collect(
                 reported = speed[g, row]
                 if reported < 0.0:
                     continue
-                d = min(max(min(reported, fastest) - centre[k, s], -clip), clip)
+                most = np.floor(clip / grid[c])
+                steps = np.rint((min(reported, fastest) - centre[k, s]) / grid[c])
+                steps = min(max(steps, -most), most)
+                d = steps * grid[c]
                 cost = prices[k, c] * (1.0 + ratio * d * d / (clip * clip))
                 if ledgers[g, v] + cost <= budget[g]:
                     ledgers[g, v] += cost
-                    sums[k, c, 0] += 1.0
-                    sums[k, c, 1] += d
+                    counts[c] += 1
+                    deviations[c] += np.int64(steps)
                 else:
                     refused[k, g] += 1
+        for c in range(n_columns):
+            sums[k, c, 0] = counts[c]
+            sums[k, c, 1] = deviations[c] * grid[c]
+
+
+def require_exact_sums(sigma: FloatArray, clip: float) -> None:
+    """Refuse noise so small that sums of `MOST_VEHICLES` contributions would not be exact.
+
+    Sums and noise are doubles, which hold all multiples of a grid up to 2^53 of them.
+
+    Args:
+        sigma: Smallest deviations of the noise of counts and of sums of deviations, shape (2,).
+        clip: D [km/h].
+
+    Raises:
+        ValueError: See above.
+    """
+    steps = max(1.0 / grid_of(float(sigma[0])), clip / grid_of(float(sigma[1])))
+    require(
+        steps * MOST_VEHICLES < 2.0**52,
+        "privacy.epsilon",
+        f"smaller: sums of {MOST_VEHICLES} vehicles must be exact in double precision",
+        f"noise of {sigma.tolist()} vehicles and km/h",
+    )

@@ -203,9 +203,9 @@ class SpeedFront(Schedule):
     with the estimated speeds v of the segment and of its neighbours in units of the reward, the
     place x from 0 upstream to 1 downstream, and q the mean of the squared normalised innovations of
     density and speed, averaged over measurements: a new one counts a fifth. Exponent and constants
-    were chosen on validation traffic of ``dptse/PrivateHighway-v0`` with the EKF, for which it is
-    made: the deviations of that filter say little of where it errs. A step
-    sorts the segments once.
+    were chosen on validation traffic of ``dptse/PrivateHighway-v1`` with ``privacy="capped"`` and
+    the EKF, for which it is made: the deviations of that filter say little of where it errs. A
+    step sorts the segments once.
     """
 
     age_power: ClassVar[float] = 1.5

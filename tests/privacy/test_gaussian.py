@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dptse_env.privacy import (
+    DELTAS,
     EpsilonTable,
     ReleaseAccount,
     contribution_sensitivity,
@@ -19,6 +20,7 @@ from dptse_env.privacy import (
     joint_noise_std,
     le_ny_kappa,
     mu_of,
+    over_trips,
     paper_sensitivity,
     printed_noise_std,
     single_noise_std,
@@ -46,7 +48,7 @@ def exact_delta(mu, epsilon):
     with mpmath.workdps(60):
         mu, epsilon = mpmath.mpf(mu), mpmath.mpf(epsilon)
         first = mpmath.ncdf(mu / 2 - epsilon / mu)
-        return float(first - mpmath.exp(epsilon) * mpmath.ncdf(-mu / 2 - epsilon / mu))
+        return first - mpmath.exp(epsilon) * mpmath.ncdf(-mu / 2 - epsilon / mu)
 
 
 # --- relations -------------------------------------------------------------------------------
@@ -76,7 +78,7 @@ def test_golden_multipliers(epsilon, delta, kappa, analytic, digits):
 def test_delta_matches_the_definition_in_many_digits(mu, deviations):
     """Over the whole of its range: `deviations` is minus the argument of the leading term."""
     epsilon = max(mu * (deviations + mu / 2.0), 0.0)
-    assert delta_of(mu, epsilon) == close(exact_delta(mu, epsilon), 2e-11)
+    assert delta_of(mu, epsilon) == close(float(exact_delta(mu, epsilon)), 2e-11)
 
 
 @few
@@ -85,6 +87,25 @@ def test_epsilon_and_the_multiplier_match_dp_accounting(mu, epsilon, delta):
     oracle = get_epsilon_gaussian(1.0 / mu, delta, tol=1e-15)
     assert epsilon_of(mu, delta) == pytest.approx(oracle, rel=1e-11, abs=1e-13)
     assert 1.0 / mu_of(epsilon, delta) == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-11)
+
+
+@settings(deadline=None)
+@given(epsilon=logarithmic(1e-4, 1e4), delta=logarithmic(1e-12, 0.4999))
+@example(epsilon=5.0, delta=1e-12)
+@example(epsilon=20.0, delta=0.05)
+@example(epsilon=1e-4, delta=0.05)
+@example(epsilon=1e4, delta=1e-12)
+@example(epsilon=1.759694e-4, delta=3.201763e-4)  # a mu just above where the formula changes
+@example(epsilon=3.147896e-4, delta=3.339089e-4)
+def test_mu_is_exact_to_twice_ten_to_the_minus_twelve_wherever_a_guarantee_may_be(epsilon, delta):
+    """By Newton's step from it, whose slope is the density of the leading term, in 60 digits."""
+    mu = mu_of(epsilon, delta)
+    with mpmath.workdps(60):
+        excess = exact_delta(mu, epsilon) - mpmath.mpf(delta)
+        slope = mpmath.npdf(mpmath.mpf(mu) / 2 - mpmath.mpf(epsilon) / mu)
+        assert abs(excess / slope / mu) < 2e-12
+    # That of dp-accounting has an error of its own, where epsilon is small.
+    assert 1.0 / mu == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-10)
 
 
 @settings(deadline=None)
@@ -224,3 +245,15 @@ def test_an_account_charges_a_step_for_each_contribution_and_the_paper_s_all_at_
     assert whole.spent(np.array([0, 7]))[0].tolist() == [2.0, 2.0]
     found = account.epsilons(np.array([0.0, 1.0, 4.0, 9.0]))
     assert found == pytest.approx(epsilon.tolist())
+
+
+def test_trips_of_one_vehicle_compose():
+    for n, row in over_trips(1.02, (1, 4, 250)).items():
+        mu = row.pop("mu")
+        assert mu == pytest.approx(math.hypot(*[1.02] * n), rel=1e-14)
+        assert list(row) == list(DELTAS)
+        for delta, epsilon in row.items():
+            assert epsilon == close(get_epsilon_gaussian(1.0 / mu, float(delta)), 1e-9)
+    for mu, trips in ((0.0, 1), (1.0, 0), (1.0, 1.5)):
+        with pytest.raises(ValueError, match=r"^(mu|trips) must be"):
+            over_trips(mu, (trips,))

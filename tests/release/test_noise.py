@@ -1,11 +1,16 @@
-"""Noise of releases, with a residual test that the seeded mutations below fail."""
+"""Noise of releases: its distribution, streams and grid, each with mutations that fail."""
 
+import math
+
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
-from dptse_env.release.noise import BLOCK, Noise, grid_of
+from dptse_env.release import noise as module
+from dptse_env.release.noise import BLOCK, DOUBT, FAR, Noise, grid_of, normal_of, rounded_normal
 
 from .worlds import ONE, residual_faults, streams
 
@@ -62,13 +67,110 @@ def test_residuals_are_white_and_of_the_stated_size_and_those_of_a_fault_are_not
     class Faulty(Noise):
         def _draw(self, row, generator):
             super()._draw(row, generator)
-            self._noise[row] = FAULTS[symptom](self._noise[row])
+            self._normal[row] = FAULTS[symptom](self._normal[row])
 
     noise = started(0, kind=Faulty)
     truth = np.random.default_rng(99).uniform(0.0, 300.0, (550, 1, S, 2))
     released = np.stack([added(noise, values) for values in truth])
     faults = residual_faults(truth[:, 0], released[:, 0], SIGMA)
     assert symptom in faults if symptom else faults == []
+
+
+# --- the distribution ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [0.3, 2.0, FAR, 8.0])
+def test_normal_numbers_are_within_a_thousandth_of_the_doubt_that_is_allowed(size):
+    """Of the end of the 64 bits that lies nearest to the middle of the distribution, by mpmath."""
+    with mpmath.workdps(40):
+        v = int(mpmath.erfc(size / mpmath.sqrt(2)) * 2**63)
+        for tail in (v, v + 1, v + 12345):
+            exact = -mpmath.sqrt(2) * mpmath.erfinv(1 - mpmath.mpf(2 * tail + 1) / 2**64)
+            above, below = normal_of(np.array([2 * tail, 2 * tail + 1], dtype=np.uint64)).tolist()
+            assert below == -above
+            assert abs(float(below - exact)) < DOUBT * (1.0 + size) / 1000.0
+
+
+def interval(scale, found):
+    """The values of the distribution function whose normal numbers round to an integer."""
+    with mpmath.workdps(60):
+        return [mpmath.ncdf((mpmath.mpf(found) + side) / scale) for side in (-0.5, 0.5)]
+
+
+@pytest.mark.parametrize("scale", [700.5, 1500.3, 3e6])
+@pytest.mark.parametrize("border", [0, 2000])
+def test_bits_at_the_border_between_two_integers_are_settled_by_more_of_them(scale, border):
+    """The 64 bits hold a border; what comes after them decides, and nothing else."""
+    with mpmath.workdps(60):
+        at = mpmath.ncdf(-(mpmath.mpf(border) + mpmath.mpf(0.5)) / scale) * mpmath.mpf(2) ** 64
+        tail, rest = int(mpmath.floor(at)), int(mpmath.floor((at - mpmath.floor(at)) * 2**64))
+    for first, expected in ((rest + 2, border), (max(rest - 2, 0), border + 1)):
+        further = iter([first, 0])
+        found = rounded_normal(scale, 2 * tail + 1, lambda further=further: next(further))
+        low, high = interval(scale, found)
+        with mpmath.workdps(60):
+            value = (mpmath.mpf(tail) + mpmath.mpf(first) / 2**64) / 2**64
+            assert low < value < high
+        assert found == -expected
+        assert next(further, None) is None or next(further, None) is None
+
+
+@pytest.mark.parametrize("scale", [0.75, 1500.3])
+def test_exact_and_fast_noise_agree_wherever_the_fast_one_is_certain(scale):
+    bits = np.random.default_rng(0).integers(2**64, size=300, dtype=np.uint64)
+
+    def none_more():
+        raise AssertionError("64 bits suffice here")
+
+    exact = [rounded_normal(scale, each, none_more) for each in bits.tolist()]
+    np.testing.assert_array_equal(exact, np.rint(scale * normal_of(bits)))
+
+
+def test_where_all_noise_is_in_doubt_releases_are_the_same(monkeypatch):
+    """Each number is then settled by itself, and the stream goes on as if none had been."""
+    certain = drawn(started(1), 3, ONE)
+    monkeypatch.setattr(module, "DOUBT", 1.0)
+    np.testing.assert_array_equal(drawn(started(1), 3, ONE), certain)
+
+
+def test_just_what_an_error_could_take_to_another_integer_and_what_is_far_is_settled(monkeypatch):
+    """Numbers are three times as large as normal ones, and a settled one shows as 7."""
+    monkeypatch.setattr(module, "rounded_normal", lambda scale, bits, more: 7)
+    monkeypatch.setattr(module, "normal_of", lambda bits: 3.0 * normal_of(bits))
+    monkeypatch.setattr(module, "DOUBT", 2.0**-15)
+    found = drawn(started(0), BLOCK) / np.array([2.0**-6, 2.0**-7])
+    bits = streams(0)[0].integers(2**64, size=(BLOCK, 1, S, 2), dtype=np.uint64)
+    z, scale = 3.0 * normal_of(bits), SIGMA / np.array([2.0**-6, 2.0**-7])
+    error = 2.0**-15 * (1.0 + abs(z))
+    low, high, far = np.rint(scale * (z - error)), np.rint(scale * (z + error)), abs(z) > FAR
+    np.testing.assert_array_equal(found, np.where((low != high) | far, 7.0, low))
+    assert (far & (low == high)).any()
+    assert 0.1 < (low != high).mean() < 0.9
+
+
+@pytest.mark.parametrize("source", ["seeded", "secure"])
+def test_released_integers_have_the_probabilities_of_a_rounded_gaussian(source):
+    scale, columns = 1500.3, 5000
+    noise = Noise(1, columns, source)
+    noise.reset(ONE, streams(5))
+    zeros, sigma = np.zeros((1, columns, 2)), np.full((1, columns, 2), scale)
+    steps = np.concatenate([noise.added(ONE, zeros, sigma, np.ones(columns)) for _ in range(40)])
+    np.testing.assert_array_equal(steps, np.rint(steps))
+    borders = [-math.inf, *(np.arange(-40, 41) * 100 + 0.5), math.inf]
+    expected = np.diff(stats.norm.cdf(borders, scale=scale)) * steps.size
+    assert stats.chisquare(np.histogram(steps, borders)[0], expected).pvalue > 1e-4
+    # Every bit is used: the last digits are uniform, and no two columns have the same noise.
+    last = np.bincount((steps.ravel() % 10).astype(int))
+    assert stats.chisquare(last).pvalue > 1e-4
+    assert np.unique(steps[0, :, 0]).size > 0.5 * np.unique(steps[0]).size
+
+
+def test_secure_noise_takes_no_seed():
+    first, second = (Noise(1, S, "secure") for _ in range(2))
+    for noise in (first, second):
+        noise.reset(ONE, streams(1))
+    assert (drawn(first, 1) != drawn(second, 1)).mean() > 0.99
+    assert first._further(0)() != second._further(0)()
 
 
 # --- streams ---------------------------------------------------------------------------------
@@ -89,7 +191,8 @@ def test_an_episode_has_its_own_stream_in_any_batch_and_interleaving(data, n_epi
                 alone[row] = stream
         else:
             found = drawn(noise, 20, chosen)
-            expected = [alone[row].standard_normal((20, S, 2)) * SIGMA for row in chosen]
+            bits = [alone[row].integers(2**64, size=(20, S, 2), dtype=np.uint64) for row in chosen]
+            expected = [normal_of(each) * SIGMA for each in bits]
             np.testing.assert_array_equal(found, on_grid(np.stack(expected, axis=1)))
 
 
@@ -134,7 +237,9 @@ def test_a_release_is_the_value_plus_noise_over_its_unit_in_a_fresh_array():
 @pytest.mark.parametrize("sigma", [(20.3, 11.2), (1e-3, 1e9), (1024.0, 0.5)])
 def test_releases_lie_on_a_public_grid_much_finer_than_the_noise(sigma):
     grid = np.array([grid_of(each) for each in sigma])
-    assert ((grid <= np.divide(sigma, 1024.0)) & (grid > np.divide(sigma, 2048.0))).all()
+    assert (grid <= np.divide(sigma, 1024.0)).all()
+    assert ((grid > np.divide(sigma, 2048.0)) | (grid == 1.0)).all()
+    assert (grid <= 1.0).all()  # so that counts are multiples of it
     np.testing.assert_array_equal(np.frexp(grid)[0], 0.5)  # powers of two
     values = np.random.default_rng(0).uniform(0.0, 300.0, (1, S, 2))
     steps = added(started(1), values, sigma=sigma) / grid

@@ -22,6 +22,7 @@ from dptse_env.release.noise import Noise
 from tests.helpers import AWAY, record
 
 from .worlds import (
+    BOTH,
     COLUMNS,
     LENGTH,
     LIMIT,
@@ -40,6 +41,7 @@ from .worlds import (
     predicting,
     request,
     residual_faults,
+    sigma_at,
     squared_distance,
     stays,
     streams,
@@ -86,7 +88,7 @@ def test_residuals_are_white_and_of_the_stated_size_but_for_less_noise(wish, kin
             second, prediction=predicting(np.linspace(5.0, 90.0, 8)), n_columns=n_columns
         )
         found = release.release(asked)
-        sums, _ = twin.collect(asked, release.prices, found.centre)
+        sums, _ = twin.collect(asked, release.prices, found.centre, found.sigma * LENGTH)
         true.append((sums / LENGTH / found.sigma)[0])
         released.append((found.values / found.sigma)[0])
     # A query and a sensor of the same segment, 5, are neighbours here.
@@ -103,23 +105,24 @@ def test_noise_is_that_of_the_prices_on_a_grid_that_is_as_public():
         deviations = released.sigma * LENGTH
         np.testing.assert_allclose(deviations[..., 0], release.prices**-0.5, rtol=1e-12)
         np.testing.assert_allclose(deviations[..., 1], 40.0 * release.prices**-0.5, rtol=1e-12)
-        grid = np.exp2(np.floor(np.log2(deviations / 1024.0)))
+        grid = np.minimum(np.exp2(np.floor(np.log2(deviations / 1024.0))), 1.0)
         steps = released.values * LENGTH / grid
         np.testing.assert_allclose(steps, np.rint(steps), rtol=1e-12, atol=0.0)
 
 
 def test_a_second_episode_is_released_like_the_first():
-    """No ledger, price or account outlasts a reset."""
-    release = started(Worlds(crowd()), epsilon=0.5)
+    """No ledger, price or account of either of two episodes outlasts a reset."""
+    release = started(Worlds(crowd(), crowd(seed=1)), epsilon=0.5)
     told = []
     for _ in range(2):
-        release.reset(ONE, streams(3))
+        release.reset(BOTH, streams(3, 4))
         assert not release.prices.any()
-        assert not np.concatenate([*release.spent(ONE, ONE), release.budgets_spent(ONE)]).any()
-        assert not release.private(ONE, ONE)["n_refused"].any()
-        rounds = [release.release(request(second)) for second in np.tile(ROUNDS, 3).tolist()]
+        assert not np.concatenate([*release.spent(BOTH, BOTH), release.budgets_spent(BOTH)]).any()
+        assert not release.private(BOTH, BOTH)["n_refused"].any()
+        asked = [request(second, episodes=BOTH) for second in np.tile(ROUNDS, 3).tolist()]
+        rounds = [release.release(each) for each in asked]
         values = [np.concatenate([each.values, each.sigma]) for each in rounds]
-        told.append((values, release.ledgers.paid.copy(), release.private(ONE, ONE)["n_refused"]))
+        told.append((values, release.ledgers.paid.copy(), release.private(BOTH, BOTH)["n_refused"]))
     for first, second in zip(*told, strict=True):
         np.testing.assert_array_equal(first, second)
         assert np.any(first)
@@ -217,10 +220,19 @@ def test_a_part_of_the_budget_is_kept_back_for_rounding(adjacency):
     release = started(Worlds(stays(1, 60.0)), adjacency=adjacency)
     asked, centre = request(1), np.full((1, COLUMNS), 60.0)
     prices = np.full((1, COLUMNS), release.budget[0] / 4.0)
-    counts = [release.collect(asked, prices, centre)[0][0, 1, 0] for _ in range(4)]
+    public = prices, centre, sigma_at(release, prices)
+    counts = [release.collect(asked, *public)[0][0, 1, 0] for _ in range(4)]
     assert counts == [1.0, 1.0, 1.0, 0.0]
     (offered,) = release.pacing.budget
     assert offered < release.ledgers.budget[0] < release.budget[0]
+
+
+def test_more_payments_than_the_reserve_covers_are_refused(monkeypatch):
+    """A vehicle may pay every query of its segment in every second."""
+    monkeypatch.setattr("dptse_env.privacy.gaussian.MOST_PAYMENTS", 3 * T)
+    WANDERER.release(PacedSettings(), spans=(1, 2), bandwidth=6)
+    with pytest.raises(ValueError, match=r"^horizon must be shorter: .* 24 times .*48 payments"):
+        WANDERER.release(PacedSettings(), spans=(1, 2, 3), bandwidth=6)
 
 
 # --- the account, and the report ---------------------------------------------------------------
@@ -270,18 +282,18 @@ def test_where_queries_overlap_the_account_adds_what_a_vehicle_pays_for_all_of_t
 @pytest.mark.parametrize(("unit", "adjacency"), [("trip", "replace"), ("event", "add_remove")])
 def test_the_report_says_what_is_guaranteed(unit, adjacency):
     privacy = {"unit": unit, "adjacency": adjacency, "pace": 0.7, "clip": 25.0}
-    found = privacy_report(resolve("private-highway-v1", {"privacy": privacy}))
+    found = privacy_report(resolve("private-highway", {"privacy": privacy}))
     mu = mu_of(5.0, 0.05)
     assert ("whole trip" in found.protects) == (unit == "trip")
-    assert found.protects.endswith("replaced by another" if adjacency == "replace" else "removed")
-    assert found.guarantee.startswith("(5, 0.05)-differential privacy of count and flow together")
-    assert found.guarantee.endswith(found.protects)
+    assert found.protects.endswith("or by none" if adjacency == "replace" else "removed")
+    assert found.guarantee.startswith("2.1181-Gaussian differential privacy, which is (5, 0.05)-")
+    assert f"{found.protects}, against whoever does not know the seed" in found.guarantee
     assert found.void_reasons == ()
     assert (found.preset, found.speed_release) == ("paced", "flow")
     assert found.boundary_inputs == "nominal"
     assert found.mu == pytest.approx(mu, rel=1e-12)
     assert found.epsilon == pytest.approx(5.0, rel=1e-9)
-    assert found.epsilon_strict == pytest.approx(epsilon_of(mu, 1e-4))
+    assert found.epsilons["1e-4"] == pytest.approx(epsilon_of(mu, 1e-4))
     squares = 2.0 if adjacency == "replace" else 1.0
     assert found.assumptions == {"budget": pytest.approx(mu**2 / squares)}
     assert found.details == {**privacy, "ratio": 1.0}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dptse_env.release import Group, PacedSettings, Traffic
-from dptse_env.release.vehicles import Ledgers
+from dptse_env.release.vehicles import Ledgers, require_exact_sums
 from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
 from tests.helpers import UNEVEN, pairwise
 
@@ -75,6 +75,13 @@ def test_missing_records_are_made_together_and_loaded_once(monkeypatch):
     assert ensured == [[7, 9]]
 
 
+def test_a_record_of_more_vehicles_than_sums_can_hold_is_refused(monkeypatch):
+    monkeypatch.setattr("dptse_env.release.vehicles.MOST_VEHICLES", 29)
+    Worlds(crowd(29)).release(PacedSettings())
+    with pytest.raises(ValueError, match=r"^the record of traffic seed 0 must be of at most 29 "):
+        Worlds(crowd(30)).release(PacedSettings())
+
+
 # --- ledgers ----------------------------------------------------------------------------------
 
 
@@ -122,3 +129,10 @@ def test_a_reset_begins_new_budgets_in_its_episodes_alone_and_a_wider_record_kee
     (told,) = ledgers.of(ONE, np.array([20]))
     np.testing.assert_array_equal(told, kept)
     assert not np.shares_memory(told, ledgers.paid)
+
+
+@pytest.mark.parametrize(("sigma", "clip"), [((1e-7, 1.0), 25.0), ((1.0, 1e-6), 25.0)])
+def test_noise_too_small_for_exact_sums_is_refused(sigma, clip):
+    require_exact_sums(np.ones(2), clip)
+    with pytest.raises(ValueError, match=r"^privacy\.epsilon must be smaller: sums of 1048576"):
+        require_exact_sums(np.array(sigma), clip)

@@ -10,6 +10,7 @@ from scipy import stats
 
 from dptse_env.estimators import Estimate
 from dptse_env.release import RELEASE_MODELS, Group, QueryOptions, Request, Task, Traffic
+from dptse_env.release.noise import grid_of
 from dptse_env.release.vehicles import Ledgers
 from dptse_env.traffic import SHORT_HIGHWAY
 from tests.helpers import AWAY, record, short_road
@@ -177,7 +178,14 @@ def collected(release, public):
     for second, numbers in enumerate(zip(*public, strict=True), 1):
         observed, prices, centre = (np.tile(each, (episodes.size, 1)) for each in numbers)
         asked = request(second, observed, episodes=episodes, n_columns=n_columns)
-        yield release.collect(asked, prices, centre)
+        yield release.collect(asked, prices, centre, sigma_at(release, prices))
+
+
+def sigma_at(release, prices):
+    """Deviations of the noise of a paced release at prices (k, C), shape (k, C, 2)."""
+    settings = release.task.settings
+    count = 1.0 / np.sqrt(prices)
+    return np.stack([count, settings.clip / np.sqrt(settings.ratio) * count], axis=-1)
 
 
 def squared_distance(release, public):
@@ -205,8 +213,9 @@ class PlainLedgers(Ledgers):
         return price * (1.0 + self.ratio * d * d / (self.clip * self.clip))
 
     def told(self, raw):
-        """The deviation that is released."""
-        return min(max(raw, -self.clip), self.clip)
+        """The deviation that is released, a multiple of the grid."""
+        most = np.floor(self.clip / self.grid)
+        return min(max(np.rint(raw / self.grid), -most), most) * self.grid
 
     def __init__(self, *args, **keywords):
         super().__init__(*args, **keywords)
@@ -217,7 +226,7 @@ class PlainLedgers(Ledgers):
         gone = set(episodes.tolist())
         self.accounts = {key: paid for key, paid in self.accounts.items() if key[0] not in gone}
 
-    def collect(self, episodes, observed, rows, prices, centre):
+    def collect(self, episodes, observed, rows, prices, centre, sigma):
         first, span, group = self._columns
         sums = np.zeros((*observed.shape, 2))
         refused = np.zeros((len(observed), self.budget.size), dtype=np.int64)
@@ -232,6 +241,7 @@ class PlainLedgers(Ledgers):
                     if rows.speed[g, row] < 0.0:
                         continue
                     raw = float(min(rows.speed[g, row], self.fastest)) - centre[k, place]
+                    self.grid = grid_of(float(sigma[k, column, 1]))
                     key = episode, g, self.account(vehicle, place, column)
                     paid = self.accounts.get(key, 0.0)
                     cost = self.cost(prices[k, column], raw, column, nth)

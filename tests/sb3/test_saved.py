@@ -177,7 +177,6 @@ def test_a_perceptron_queries_several_segments_at_once(path, action):
 
 
 @pytest.mark.parametrize("name", shipped_policies())
-@pytest.mark.filterwarnings("ignore:.*out of date")
 def test_a_shipped_policy_acts_where_it_was_trained(name):
     card = read_policy(name).card
     env = gym.make_vec(

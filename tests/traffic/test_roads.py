@@ -144,7 +144,7 @@ def test_bad_keywords_of_a_file_are_refused_by_file_and_key(road, line, message)
     text = ROAD.replace("bandwidth = 3", line).replace('"arz.json"', '"w99-3lane"')
     road.write_text(text)
     with pytest.raises(ValueError, match=rf"^.*My road\.toml: {message}"):
-        resolve("private-highway-v1", {"corridor": str(road)})
+        resolve("private-highway", {"corridor": str(road)})
 
 
 def test_files_that_cannot_be_read(tmp_path):
@@ -164,13 +164,13 @@ def test_files_that_cannot_be_read(tmp_path):
 def test_the_keywords_of_a_file_come_after_the_callers(road):
     road.write_text(ROAD.replace('"arz.json"', '"w99-3lane"'))
     with pytest.warns(UserWarning, match=r"corridor\.average_dwell"):
-        config = resolve("private-highway-v1", {"corridor": str(road)})
+        config = resolve("private-highway", {"corridor": str(road)})
     assert config.bandwidth == 3
     assert config.parameters == "w99-3lane"
     assert "parameters" not in config.inherited
     assert "corridor.average_dwell" in config.inherited
     with pytest.warns(UserWarning, match=r"corridor\.average_dwell"):
-        config = resolve("private-highway-v1", {"corridor": str(road), "bandwidth": 1})
+        config = resolve("private-highway", {"corridor": str(road), "bandwidth": 1})
     assert config.bandwidth == 1
 
 

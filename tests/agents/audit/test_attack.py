@@ -11,9 +11,9 @@ from agents.audit.planner import Planner, public_plan
 from agents.audit.statistics import Claim, audit
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.parts import privacy_report
-from dptse_env.privacy import epsilon_of
+from dptse_env.privacy import ROUNDING, epsilon_of
 from dptse_env.release import Capped, CappedSettings, ReleaseModel
-from dptse_env.release.noise import Noise
+from dptse_env.release.noise import Noise, grid_of
 from tests.agents.elsewhere import Elsewhere
 
 from .small import HORIZON, ROAD, config, paced, runs_of, staying
@@ -44,7 +44,7 @@ def sums_in(record, setting, observed, terms):
     mu = privacy_report(setting).mu
     is_paced = privacy.preset == "paced"
     # A part of a payment is kept back for rounding.
-    budget = mu**2 / 2.0 * (1.0 - 1e-9) if is_paced else getattr(privacy, "cap", math.inf)
+    budget = mu**2 / 2.0 * (1.0 - ROUNDING) if is_paced else getattr(privacy, "cap", math.inf)
     clip, ratio = (privacy.clip, privacy.ratio) if is_paced else (math.inf, 0.0)
     paid, sums = {}, np.zeros_like(sigma)
     for step, segment, vehicle, speed in zip(
@@ -57,7 +57,9 @@ def sums_in(record, setting, observed, terms):
             sums[step - 1, segment] += 1.0, speed
             continue
         price = (sigma[step - 1, segment, 0] * ROAD.segment_length) ** -2 if is_paced else 1.0
-        d = min(max(min(speed, ROAD.speed_limit) - centre[step - 1, segment], -clip), clip)
+        grid = grid_of(float(sigma[step - 1, segment, 1] * ROAD.segment_length))
+        d = np.rint((min(speed, ROAD.speed_limit) - centre[step - 1, segment]) / grid) * grid
+        d = min(max(d, -np.floor(clip / grid) * grid), np.floor(clip / grid) * grid)
         cost = price * (1.0 + ratio * (d / clip) ** 2)
         if paid.get(vehicle, 0.0) + cost <= budget:
             paid[vehicle] = paid.get(vehicle, 0.0) + cost
@@ -243,6 +245,3 @@ def test_what_cannot_be_audited_is_refused(record):
     worlds = AdjacentWorlds(record, (staying(1), staying(3)))
     with pytest.raises(ValueError, match=r"a release model with Gaussian noise.*Silent"):
         runs_of(config(preset=Silent), worlds, policy=np.ones((HORIZON, 6), dtype=bool))
-    spans = dataclasses.replace(paced(), query_spans=(1, 2))
-    with pytest.raises(ValueError, match=r"query_spans must be \(1,\)"):
-        attacked_form(spans)

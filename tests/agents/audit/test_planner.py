@@ -33,9 +33,10 @@ def test_moves_are_the_distance_of_a_second(preset, record):
         plan[step - 1, int(record.segment[row])] = True
         worlds = AdjacentWorlds(rest, (moved, Trajectory.absent()))
         distance = mu * reached(setting, worlds, plan, 1)
-        assert distance**2 == pytest.approx(np.sum(moves**2), rel=1e-9)
+        # Deviations of speeds are rounded to the grid of the noise.
+        assert distance**2 == pytest.approx(np.sum(moves**2), rel=1e-2)
         outside = planner.moves(rest, moved)
-        assert distance**2 == pytest.approx(np.sum(outside**2), rel=1e-9)
+        assert distance**2 == pytest.approx(np.sum(outside**2), rel=1e-2)
 
 
 @pytest.mark.parametrize("preset", ["paper", "capped"])
@@ -145,6 +146,19 @@ ALL = [
     if setting.privacy.adjacency == "replace" or kind not in ("replaced", "opposite")
     if (kind, setting, policy) not in FEW
 ]
+
+
+@pytest.mark.parametrize("policy", ["hunter", "round-robin"])
+@pytest.mark.parametrize(("spans", "levels"), [((1, 2), (0.5, 1.0, 3.0)), ((2,), (1.0,))])
+def test_options_of_several_segments_and_prices_reach_mu_and_no_more(spans, levels, policy, record):
+    setting = dataclasses.replace(paced("ekf", bandwidth=4), query_spans=spans, price_levels=levels)
+    planner = Planner(setting, policy)
+    for kind in ("worst-case", "replaced"):
+        worlds = planner.choose(record, kind)
+        plan = planner.plan(worlds)
+        assert (plan @ setting.queries.cost).max() <= 4
+        least = 0.95 if (kind, policy) == ("worst-case", "hunter") else 0.5
+        assert least < reached(setting, worlds, policy) <= 1.0 + 1e-9
 
 
 @pytest.mark.parametrize(("kind", "setting", "policy"), fast_and_slow([*FEW, *ALL], FEW))

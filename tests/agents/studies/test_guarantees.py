@@ -98,6 +98,6 @@ def test_exact_releases_the_true_densities_of_what_is_queried_and_claims_nothing
         np.testing.assert_allclose(released, truth, atol=0.1)
         largest = max(largest, *truth)
     assert largest > 10.0
-    assert math.isinf(info["epsilon"])
+    assert math.isinf(info["spent_epsilon"])
     report = privacy_report(make_config(SHORT, paid(release="exact").keywords))
     assert (report.guarantee, report.void_reasons) == ("none", ("not_stated",))

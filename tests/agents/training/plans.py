@@ -9,7 +9,7 @@ from tests.helpers import SHORT
 
 ENV = f'{SHORT} {{"horizon": 80, "privacy": "capped"}}'
 WIDE = f'{SHORT} {{"horizon": 80, "privacy": "capped", "bandwidth": 3}}'
-OTHER = 'dptse_env:dptse/PrivateHighway-v0 {"horizon": 80, "bandwidth": 3}'
+OTHER = 'dptse_env:dptse/PrivateHighway-v1 {"horizon": 80, "privacy": "capped", "bandwidth": 3}'
 """A road of 15 segments beside one of 6; both have the same kinds of channels."""
 
 # Steps and rates are large, so that every round acts otherwise than the one before.

@@ -320,7 +320,7 @@ def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
 @pytest.fixture(scope="module", params=ALGORITHMS)
 def private(request, tmp_path_factory):
     """A policy of every algorithm, trained a little with the truth at hand."""
-    env = 'dptse_env:dptse/PrivateHighway-v0 {"horizon": 70}'
+    env = 'dptse_env:dptse/PrivateHighway-v1 {"horizon": 70, "privacy": "capped"}'
     plan = make_plan(request.param, envs=(env,), traffic_seeds=(0, 1), validation_seeds=(1000,))
     folder = tmp_path_factory.mktemp(request.param)
     train(plan, folder)
