@@ -97,9 +97,7 @@ class SumoScenario:
         """Check the fields and bring them to their declared types."""
         checked_fields(self, _PATH)
         n_files, n_sums = len(self.files), len(self.sha256)
-        require(
-            n_sums == n_files, f"{_PATH}.sha256", f"one for each of {n_files} files", n_sums
-        )
+        require(n_sums == n_files, f"{_PATH}.sha256", f"one for each of {n_files} files", n_sums)
         allowed = f"at most begin = {self.begin} s"
         require(self.warm_up <= self.begin, f"{_PATH}.warm_up", allowed, self.warm_up)
         steps = 1.0 / self.step_length
@@ -129,7 +127,7 @@ class SumoScenario:
     def _check_columns(self) -> None:
         taken: dict[str, list[tuple[float, float]]] = {}
         for i, stretches in enumerate(self.columns):
-            path = ff"{_PATH}.columns[{i}]"
+            path = f"{_PATH}.columns[{i}]"
             require(bool(stretches), path, "at least one stretch of an edge", stretches)
             for edge, start, end in stretches:
                 require(start < end, path, "stretches that end after they start", (start, end))
