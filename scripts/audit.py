@@ -1,6 +1,7 @@
 """Attack the privacy of an environment, and bound from below what its releases reveal.
 
 dptse audit --env dptse_env:dptse/ShortHighway-v0 --runs 100
+dptse audit --env dptse_env:dptse/PaperHighway-v0 --one-run
 """
 
 from __future__ import annotations
@@ -9,14 +10,15 @@ import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from agents.audit.planner import Planner
-from agents.audit.report import audit_environment
+from agents.audit.report import audit_environment, audit_one_run
 from agents.environments import make_config, parse_env
 from agents.files import refuse_to_replace
 from agents.play import Cell
 from dptse_env.parts import privacy_report
-from dptse_env.utils.fields import inside, integer, positive
+from dptse_env.utils.fields import inside, integer, positive, require
 from scripts.cli import Environment, Machines
 
 
@@ -32,6 +34,8 @@ class Args(Environment, Machines):
     """Queries: hunter, adaptive, or a public schedule (paper, static, round-robin)."""
     runs: int = 5000
     """Runs in each of the two worlds."""
+    one_run: bool = False
+    """One episode with many vehicles that differ; target, policy and runs are its own."""
     noise_factor: float = 1.0
     """Factor on the real noise, not the declared one; below 1 is to be rejected."""
     traffic_seed: int = 0
@@ -59,25 +63,28 @@ def main(args: Args) -> None:
     env, keywords = parse_env(args.env)
     Cell(env, "none", keywords).check()
     config = make_config(env, keywords)
+    if args.one_run:
+        for name in ("target", "policy", "runs"):
+            given = getattr(args, name)
+            require(given == getattr(Args, name), name, "left out with --one-run", given)
     Planner(config, args.policy).require_kind(args.target)
     preset = re.sub(r"\W+", "-", privacy_report(config).preset)
     noise = "" if args.noise_factor == 1.0 else f"-noise-{args.noise_factor:g}"
-    path = args.output / f"{preset}-{args.target}-{args.policy}{noise}.json"
+    attack = "one-run" if args.one_run else f"{args.target}-{args.policy}"
+    path = args.output / f"{preset}-{attack}{noise}.json"
     refuse_to_replace([path], args.force)
 
     executor = args.start_executor()
     library = args.library(config.corridor, [args.traffic_seed])
-    finding = audit_environment(
-        config,
-        library.get(config.corridor, args.traffic_seed).vehicles_for("an audit"),
-        args.target,
-        args.policy,
-        n_runs=args.runs,
-        noise_factor=args.noise_factor,
-        confidence=args.confidence,
-        seed=args.seed,
-        executor=executor,
-    )
+    record = library.get(config.corridor, args.traffic_seed).vehicles_for("an audit")
+    options: dict[str, Any] = {
+        name: getattr(args, name) for name in ("noise_factor", "confidence", "seed")
+    }
+    if args.one_run:
+        finding = audit_one_run(config, record, **options)
+    else:
+        options |= {"n_runs": args.runs, "executor": executor}
+        finding = audit_environment(config, record, args.target, args.policy, **options)
     finding = dataclasses.replace(finding, title=f"{env.rpartition('/')[2]}, {finding.title}")
     finding.write(path, dataclasses.asdict(args))
     if args.json:

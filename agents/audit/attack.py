@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
-from agents.audit.worlds import AdjacentWorlds, audited
+from agents.audit.worlds import Worlds, audited
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate, Measurement
@@ -19,7 +19,6 @@ from dptse_env.process import QueryProcess
 from dptse_env.release import GaussianRelease, ReleaseModel, Request
 from dptse_env.release.noise import Noise
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import require
 
 BATCH = 250
 """Default number of runs per world that are played at once."""
@@ -33,7 +32,8 @@ class Queries:
     """The adversary's query policy.
 
     Attributes:
-        plan: Segments by step, shape (horizon, n_mainline).
+        plan: Options to query by step, shape (horizon, G), or (horizon, k, G) where each of k runs
+            has its own.
         is_adaptive: Whether it stops where it is decided between the worlds.
     """
 
@@ -41,7 +41,7 @@ class Queries:
     is_adaptive: bool = False
 
     def at(self, step: int, score: FloatArray) -> BoolArray:
-        """Return the segments to query, shape (k, n_mainline), given the scores so far, (k,)."""
+        """Return the options to query, shape (k, G), given the scores so far, (k,)."""
         undecided = (np.abs(score) < DECISION_THRESHOLD) | (not self.is_adaptive)
         queries: BoolArray = self.plan[step] & undecided[:, None]
         return queries
@@ -86,25 +86,27 @@ class Overheard(ReleaseModel):
     Attributes:
         model: The release model.
         last: Its last release.
+        heard: Score and squared distance of each column of it, shape (2, k, C).
         score: Log-likelihood ratio of world 1 of each run's transcript so far, shape (k,).
         square: Squared distance between the worlds' sums so far, in units of the noise, (k,).
     """
 
     last: Measurement
+    heard: FloatArray
 
-    def __init__(self, config: EnvConfig, worlds: AdjacentWorlds, n: int, factor: float) -> None:
+    def __init__(self, config: EnvConfig, worlds: Worlds, n: int, factor: float) -> None:
         """Prepare for n runs, whose noise is multiplied by a factor.
 
         Raises:
             ValueError: The adversary does not know the distribution of the noise.
         """
         traffic = make_traffic(config, worlds)
-        traffic.load([0, 1])
+        traffic.load(np.arange(len(worlds.pairs)))
         self.model = make_release(config, n, traffic)
         super().__init__(self.model.task, traffic)
         # Every run in both worlds, whichever it is in.
         self._either = make_release(config, 2 * n, traffic)
-        self._factor = factor
+        self._pairs, self._factor = worlds.pairs, factor
         if factor != 1.0:
             _set_noise(self.model, Noise(n, self.task.n_columns, scale=factor))
         _set_noise(self._either, _Noiseless())
@@ -129,9 +131,11 @@ class Overheard(ReleaseModel):
         sigma = self._factor * self.last.sigma
         zero, one = (mean / sigma for mean in self._means(request))
         difference = np.where(self.last.observed[:, :, None], one - zero, 0.0)
-        heard = (self.last.values / sigma - 0.5 * (zero + one)) * difference
-        self.score[request.episodes] += np.sum(heard, axis=(1, 2))
-        self.square[request.episodes] += np.sum(difference**2, axis=(1, 2))
+        told = (self.last.values / sigma - 0.5 * (zero + one)) * difference
+        self.heard = np.stack([told.sum(axis=2), np.sum(difference**2, axis=2)])
+        score, square = self.heard.sum(axis=2)
+        self.score[request.episodes] += score
+        self.square[request.episodes] += square
         return self.last
 
     def _means(self, request: Request) -> tuple[FloatArray, FloatArray]:
@@ -143,7 +147,7 @@ class Overheard(ReleaseModel):
         k = len(request.episodes)
         both = Request(
             self._in_both(request.episodes),
-            np.repeat([0, 1], k),
+            self._pairs[request.traffic].T.ravel(),
             np.tile(request.times, 2),
             np.tile(request.observed, (2, 1)),
             predicted_twice,
@@ -165,16 +169,17 @@ def _set_noise(release: Any, noise: Noise) -> None:
 
 
 def make_overheard(
-    config: EnvConfig, worlds: AdjacentWorlds, n: int, factor: float = 1.0
+    config: EnvConfig, worlds: Worlds, n: int, factor: float = 1.0
 ) -> tuple[QueryProcess, Overheard]:
-    """Return a process of n episodes in either world, and its release model, overheard."""
+    """Return a process of n episodes of some worlds, and its release model, overheard."""
+    config = audited(attacked_form(config), worlds)
     release = Overheard(config, worlds, n, factor)
     return QueryProcess(make_parts(config, n, traffic=release.traffic, release=release)), release
 
 
 def attack(
     config: EnvConfig,
-    worlds: AdjacentWorlds,
+    worlds: Worlds,
     queries: Queries,
     n_runs: int,
     *,
@@ -202,7 +207,6 @@ def attack(
     Raises:
         ValueError: The adversary does not know the distribution of the noise.
     """
-    config = audited(attacked_form(config), worlds)
     played = run_in_order(
         executor,
         partial(play, config, worlds, queries, noise_factor, seed),
@@ -220,23 +224,47 @@ def attack(
 
 def play(
     config: EnvConfig,
-    worlds: AdjacentWorlds,
+    worlds: Worlds,
     queries: Queries,
     noise_factor: float,
     seed: int,
     runs: range,
 ) -> Runs:
     """Play some runs in both worlds; their numbers seed their noise."""
-    n = len(runs)
-    process, release = make_overheard(config, worlds, 2 * n, noise_factor)
-    for world in (0, 1):
-        # A run's noise stream does not depend on the batch.
-        streams = [np.random.default_rng((seed, world, run)) for run in runs]
-        process.reset(world * n + np.arange(n), streams, {"traffic_seed": world, "start": 0})
+    # A run's noise stream does not depend on the batch.
+    streams = [np.random.default_rng((seed, world, run)) for world in (0, 1) for run in runs]
+    seeds = np.repeat([0, 1], len(runs))
+    *_, release = overheard(config, worlds, seeds, queries, streams, noise_factor)
+    return Runs(release.score.reshape(2, -1), np.sqrt(release.square).reshape(2, -1))
+
+
+def overheard(
+    config: EnvConfig,
+    worlds: Worlds,
+    seeds: IntArray,
+    queries: Queries,
+    streams: Sequence[np.random.Generator],
+    factor: float = 1.0,
+) -> Iterator[Overheard]:
+    """Play an episode of each of k worlds; give the overheard release model after every second.
+
+    Args:
+        config: The configuration under attack.
+        worlds: The worlds.
+        seeds: Those that are played, shape (k,).
+        queries: The query policy.
+        streams: Generators that seed the k episodes.
+        factor: Multiplies the noise that the configuration declares.
+
+    Raises:
+        ValueError: The adversary does not know the distribution of the noise.
+    """
+    process, release = make_overheard(config, worlds, len(seeds), factor)
+    every = np.arange(len(seeds))
+    process.reset(every, streams, {"traffic_seed": seeds, "start": 0})
     for step in range(config.horizon_steps):
-        queried = queries.at(step, release.score)
-        process.step(np.arange(2 * n), queried.astype(np.int8))
-    return Runs(release.score.reshape(2, n), np.sqrt(release.square).reshape(2, n))
+        process.step(every, queries.at(step, release.score).astype(np.int8))
+        yield release
 
 
 def attacked_form(config: EnvConfig) -> EnvConfig:
@@ -244,16 +272,8 @@ def attacked_form(config: EnvConfig) -> EnvConfig:
 
     Where noise is constant, estimates reveal nothing beyond the releases, and the cheapest
     estimator is used. Elsewhere prices and centres follow them, so that it is the configuration's.
-
-    Raises:
-        ValueError: A query may cover several segments.
     """
-    options = make_release(config).task.queries.n_options
-    n = config.corridor.n_mainline
-    require(options == n, "query_spans", "(1,), at one price, for an audit", config.query_spans)
-    config = dataclasses.replace(
-        config, traffic_seeds=(0, 1), random_start=False, action="mask", backend="compiled"
-    )
+    config = dataclasses.replace(config, random_start=False, action="mask", backend="compiled")
     if isinstance(make_release(config), GaussianRelease):
         return dataclasses.replace(config, estimator="open_loop", estimator_settings=None)
     return config

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from agents.audit.attack import Queries, attack, attacked_form, make_overheard
+from agents.audit.attack import Queries, attack, overheard
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface, make_release
@@ -42,7 +42,7 @@ Second = tuple[float, int, int, int]  # a cost, a step, a segment and the world 
 
 
 def public_plan(config: EnvConfig, name: str) -> BoolArray:
-    """Return the queries of a public schedule, shape (horizon, n_mainline)."""
+    """Return the queries of a public schedule, shape (horizon, G)."""
     interface = make_interface(config)
     steps = np.arange(config.horizon_steps)
     size = interface.observations.space.shape[0]
@@ -75,6 +75,10 @@ class Planner:
         self.is_event = getattr(config.privacy, "unit", "trip") == "event"
         self._release, corridor = make_release(config), config.corridor
         self._is_whole = self._release.task.is_whole
+        self._queries = queries = self._release.task.queries
+        # The option to ask for each segment, shape (n_mainline,): the cheapest.
+        costs = np.where(queries.level == queries.standard_level, queries.cost, math.inf)
+        self._option = np.argmin(np.where(queries.covers.T, costs, math.inf), axis=1)
         ledgers = getattr(self._release, "ledgers", None)
         self._clip = getattr(ledgers, "clip", math.inf)
         self._fastest = float(getattr(ledgers, "fastest", math.inf))
@@ -127,7 +131,8 @@ class Planner:
 
     def _made_up(self, record: Record, kind: str) -> list[AdjacentWorlds]:
         """Return worlds that differ in made-up vehicles."""
-        here, there = self._places(record)[:2]
+        here, *others = self._places(record)
+        there = next(each for each in others if self._option[each] != self._option[here])
         stands = Trajectory.constant(self._seconds, here, 0.0)
         added = f"an added vehicle that stands on segment {here}"
         if not self.replaces:
@@ -257,7 +262,7 @@ class Planner:
         return Queries(self.plan(worlds), is_adaptive=self.policy == "adaptive")
 
     def plan(self, worlds: AdjacentWorlds) -> BoolArray:
-        """Return the policy's queries, shape (horizon, n_mainline).
+        """Return the policy's queries, shape (horizon, G).
 
         A hunter follows the vehicle in both worlds, and queries it in the seconds that tell most,
         within the bandwidth.
@@ -265,24 +270,26 @@ class Planner:
         config = self.config
         if self.policy in PUBLIC_SCHEDULES:
             return public_plan(config, self.policy)
-        plan = np.zeros((config.horizon_steps, config.corridor.n_mainline), dtype=bool)
+        cost, bandwidth = self._queries.cost, config.bandwidth
+        plan = np.zeros((config.horizon_steps, len(cost)), dtype=bool)
         candidates, left = [], []
         for world in (0, 1):
             seconds, budget = self._worthwhile(worlds, world)
             candidates += seconds
             left.append(budget)
         for _, step, segment, world in sorted(candidates):
+            option = self._option[segment]
             # Where both trajectories meet, one query serves both.
-            free = plan[step, segment] or plan[step].sum() < config.bandwidth
+            free = plan[step, option] or cost[plan[step]].sum() + cost[option] <= bandwidth
             if left[world] and free:
-                plan[step, segment] = True
+                plan[step, option] = True
                 left[world] -= 1
         if self._release.has_prices and self._is_whole:
             # What is left of the bandwidth goes round all segments. That keeps the estimator, and
             # so centres and prices, as they are in a typical episode.
             for queried, offered in zip(plan, public_plan(config, "round-robin"), strict=True):
-                spare = config.bandwidth - int(queried.sum())
-                queried[np.flatnonzero(offered & ~queried)[:spare]] = True
+                more = np.flatnonzero(offered & ~queried)
+                queried[more[cost[queried].sum() + np.cumsum(cost[more]) <= bandwidth]] = True
         return plan
 
     def _worthwhile(self, worlds: AdjacentWorlds, world: int) -> tuple[list[Second], int]:
@@ -363,7 +370,9 @@ class Planner:
         """Return flags of record columns the policy may observe, (n_steps, n_columns)."""
         observed = np.zeros((record.n_steps, record.n_columns), dtype=bool)
         is_public = self.policy in PUBLIC_SCHEDULES
-        queried = public_plan(self.config, self.policy) if is_public else True
+        queried: BoolArray | bool = True
+        if is_public:
+            queried = self._queries.covered(public_plan(self.config, self.policy))
         seconds = slice(1, self.config.horizon_steps + 1)
         observed[seconds, : self.config.corridor.n_mainline] = queried
         observed[seconds, self._always] = True
@@ -378,7 +387,7 @@ def public_terms(
     Args:
         config: The configuration.
         record: The traffic.
-        plan: Queries, shape (T, n_mainline).
+        plan: Queries, shape (T, G).
         seed: Seeds noise and estimator.
 
     Returns:
@@ -387,11 +396,11 @@ def public_terms(
         speeds [km/h], shape (T, places), NaN where mean speeds are released.
     """
     alike = AdjacentWorlds(record, (Trajectory.absent(), Trajectory.absent()))
-    process, release = make_overheard(attacked_form(config), alike, 1)
-    one, rows = np.arange(1), []
-    process.reset(one, [np.random.default_rng(seed)], {"traffic_seed": 0, "start": 0})
-    for queried in plan:
-        process.step(one, queried[None].astype(np.int8))
+    played = overheard(
+        config, alike, np.zeros(1, int), Queries(plan), [np.random.default_rng(seed)]
+    )
+    rows = []
+    for release in played:
         rows.append((release.last.sigma[0].copy(), release.last.centre[0].copy()))
     sigma, centre = (np.array(column) for column in zip(*rows, strict=True))
     task = release.task

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from agents.audit.attack import attack
+from agents.audit.one_run import KINDS, attack_in_one_run
 from agents.audit.planner import Planner
 from agents.audit.statistics import (
     AuditResult,
     Claim,
     audit,
+    audit_coins,
     detectable_mu,
     rejection_probability,
 )
@@ -38,15 +40,15 @@ class Finding:
     """The finding of one audit.
 
     Attributes:
-        target: The difference of the two worlds in words.
+        target: The difference of the two worlds, or of all canaries, in words.
         distance: Largest distance between the worlds' true sums, in units of the noise: the
-            largest mu that this attack can show.
+            largest mu that this attack can show. For one run, the distance at which equal canaries
+            would expect as many errors.
     """
 
     title: str
     target: str
     policy: str
-    n_runs: int
     noise_factor: float
     distance: float
     result: AuditResult
@@ -62,29 +64,38 @@ class Finding:
     @property
     def power(self) -> float:
         """Probability of rejecting a mechanism with a mu of `VIOLATION` times the claim."""
-        result, claimed = self.result, self.result.claim.mu
-        return rejection_probability(VIOLATION * claimed, claimed, self.n_runs, result.confidence)
+        result, mu = self.result, self.result.claim.mu
+        return rejection_probability(
+            VIOLATION * mu, mu, result.n, result.confidence, is_one_run=result.is_one_run
+        )
 
     @property
     def detectable(self) -> float:
         """Least mu for which a claim is rejected with probability 95 %, or infinity."""
-        return detectable_mu(self.result.claim.mu, self.n_runs, self.result.confidence)
+        result = self.result
+        return detectable_mu(
+            result.claim.mu, result.n, result.confidence, is_one_run=result.is_one_run
+        )
 
     def print(self) -> None:
         """Print the bounds and what they rest on; the verdict is the last line."""
         columns = "claimed", "lower\nbound", "threshold", "false +", "false -"
         table = make_table(self.title, "", *columns)
-        claim, bounds = self.result.claim, (self.result.mu, self.result.epsilon)
-        names = "mu", f"epsilon at delta {claim.delta:g}"
-        for name, claimed, bound in zip(names, (claim.mu, claim.epsilon), bounds, strict=True):
+        result, claim = self.result, self.result.claim
+        rows = [("mu", claim.mu, result.mu)]
+        if result.epsilon is not None:
+            rows.append((f"epsilon at delta {claim.delta:g}", claim.epsilon, result.epsilon))
+        for name, claimed, bound in rows:
             rates = f"<= {bound.false_positives:.4f}", f"<= {bound.false_negatives:.4f}"
             row = f"{claimed:.3f}", f"{bound.value:.3f}", f"{bound.threshold:.2f}", *rates
             table.add_row(name, *row)
         print_table(table)
+        trials = f"at most, in {result.n} runs per world"
+        if result.is_one_run:
+            trials = f"by the expected errors at {result.n} canaries of one run"
         print_text(
             f"worlds: {self.target}; queries: {self.policy}; noise x {self.noise_factor:g}\n"
-            f"distance: {self.distance:.3f} sigma at most, in {self.n_runs} runs per world "
-            f"({self.seconds:.0f} s)\n"
+            f"distance: {self.distance:.3f} sigma {trials} ({self.seconds:.0f} s)\n"
             f"epsilon of a Gaussian release with the bound on mu: {self.gaussian_epsilon:.3f}\n"
             f"power against a mu of {VIOLATION:.2f} times the claim: {self.power:.4f}"
         )
@@ -95,13 +106,14 @@ class Finding:
                 f"here up to {factor:.3f} times the declared noise"
             )
         else:
-            print_text("too few runs to reject this claim, however much leaks")
+            few = "canaries" if result.is_one_run else "runs"
+            print_text(f"too few {few} to reject this claim, however much leaks")
         if "boundary_inputs" in self.privacy.void_reasons:
             print_text(
                 "the estimates see the true traffic at the boundary, which makes their epsilon "
                 "infinite; only the releases were attacked"
             )
-        print_text(f"verdict: {self.result.verdict}, at confidence {self.result.confidence:.0%}")
+        print_text(f"verdict: {result.verdict}, at confidence {result.confidence:.0%}")
 
     def write(self, path: Path, arguments: Mapping[str, Any]) -> None:
         """Write the finding to a JSON file, with its origin."""
@@ -162,17 +174,63 @@ def audit_environment(
         seed=seed,
         executor=executor,
     )
-    epsilon, delta = report.claimed_epsilon, report.claimed_delta
-    # The account of a guarantee, or else the requested parameters.
-    mu = mu_of(epsilon, delta) if report.guarantee == "none" else report.mu
+    claim = claim_of(report)
     return Finding(
-        title=f"preset {report.preset} at ({epsilon:g}, {delta:g})",
+        title=_title(report),
         target=worlds.description,
         policy=policy,
-        n_runs=n_runs,
         noise_factor=noise_factor,
         distance=float(runs.distances.max()),
-        result=audit(runs.scores[0], runs.scores[1], Claim(mu, epsilon, delta), confidence),
+        result=audit(runs.scores[0], runs.scores[1], claim, confidence),
         privacy=report,
         seconds=time.perf_counter() - start,
     )
+
+
+def audit_one_run(
+    config: EnvConfig,
+    record: Record,
+    *,
+    noise_factor: float = 1.0,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Finding:
+    """Test the claim to users on one episode with many canaries.
+
+    `agents.audit.statistics` has what the verdict rests on: the noise of different numbers is
+    independent by the claim.
+
+    Args:
+        config: The configuration under attack, of `agents.environments.make_config`.
+        record: The other vehicles.
+        noise_factor: Multiplies the real noise, not the declared one.
+        confidence: Confidence of the lower bound on mu.
+        seed: Seeds coins and noise, >= 0.
+
+    Raises:
+        ValueError: No query leaves another segment to query, or the release model does not add its
+            noise by a `dptse_env.release.noise.Noise`.
+    """
+    report, start = privacy_report(config), time.perf_counter()
+    run = attack_in_one_run(config, record, noise_factor=noise_factor, seed=seed)
+    return Finding(
+        title=_title(report),
+        target=f"each added vehicle {KINDS[run.design.kind]}, for {run.design.slot} s",
+        policy="where they are",
+        noise_factor=noise_factor,
+        distance=run.distance,
+        result=audit_coins(run.scores, run.coins, claim_of(report), confidence),
+        privacy=report,
+        seconds=time.perf_counter() - start,
+    )
+
+
+def claim_of(report: PrivacyReport) -> Claim:
+    """Return what users are told: the account of a guarantee, or else the requested parameters."""
+    epsilon, delta = report.claimed_epsilon, report.claimed_delta
+    mu = mu_of(epsilon, delta) if report.guarantee == "none" else report.mu
+    return Claim(mu, epsilon, delta)
+
+
+def _title(report: PrivacyReport) -> str:
+    return f"preset {report.preset} at ({report.claimed_epsilon:g}, {report.claimed_delta:g})"

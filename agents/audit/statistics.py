@@ -12,6 +12,30 @@ with $\alpha$ the rate of false positives and $\beta$ that of false negatives (D
 2022, section 2). One half of the runs chooses the thresholds. The other half counts the errors,
 and exact upper bounds on their rates (Clopper and Pearson 1934) turn into lower bounds here.
 
+In one run, many canaries each have a coin that says in which of two worlds they are, and the
+adversary guesses all coins from one transcript (Steinke, Nasr and Jagielski 2023). A mechanism with
+$\mu$-Gaussian differential privacy makes him err with probability $\Phi(-\mu/2)$ or more at each.
+If, as claimed, the noise of different numbers is independent, and no two canaries move the same
+number, the errors are at least as many as those of independent trials at this rate: an exact upper
+bound on the rate gives
+
+$$\mu \ge -2 \Phi^{-1}(\bar p).$$
+
+*Proof.* In a trial with a coin, let X be a Brownian motion with drift $\mp 1/2$ by the coin, over a
+time of $\mu^2$. The transcript can be made of such motions alone, one for each canary and
+independent, and of further noise: what a canary moves in a number, as a multiple D of its noise, is
+fixed by what was released before, and the number is read off the next increment of its motion,
+over a time of $D^2$; the claim is that these times add up to at most $\mu^2$. Given all motions and
+the further noise, every guess is fixed, and the coins are independent: he errs at each with at
+least the probability e(X) with which the best guess errs that knows X alone. The e(X) are
+independent, and each has the mean $\Phi(-\mu/2)$. $\square$
+
+Without independent noise the expected number of errors has the same bound, yet their number can be
+anything: one number drawn for all canaries would make all guesses right, or all wrong, together.
+Rejected is therefore the claim with its independence. The bound of Steinke and others for
+($\varepsilon, \delta$) needs no independence; it adds 2 $\delta$ n to a probability, for n
+canaries, which leaves nothing of it at the $\delta$ and n of this package.
+
 An audit can refute a claim and never prove one. Nothing here depends on traffic.
 """
 
@@ -91,19 +115,29 @@ class AuditResult:
         claim: the claim that was tested.
         mu: lower bound on mu.
         epsilon: lower bound on epsilon at the claim's delta, for any mechanism. A large
-            epsilon shows in rare errors only, so the bound lies well below the truth.
+            epsilon shows in rare errors only, so the bound lies well below the truth. None for
+            one run.
         confidence: probability with which both bounds hold together.
+        n: runs in each world, or canaries of the one run.
     """
 
     claim: Claim
     mu: LowerBound
-    epsilon: LowerBound
+    epsilon: LowerBound | None
     confidence: float
+    n: int
+
+    @property
+    def is_one_run(self) -> bool:
+        """True if all scores are of one run."""
+        return self.epsilon is None
 
     @property
     def verdict(self) -> Literal["rejected", "not rejected"]:
         """``rejected`` if a bound lies above the claim."""
-        exceeds = self.mu.value > self.claim.mu or self.epsilon.value > self.claim.epsilon
+        exceeds = self.mu.value > self.claim.mu or (
+            self.epsilon is not None and self.epsilon.value > self.claim.epsilon
+        )
         return "rejected" if exceeds else "not rejected"
 
 
@@ -147,7 +181,32 @@ def audit(
         mu=bound(_mu(*rates), "mu"),
         epsilon=bound(_epsilon(*rates, claim.delta), "epsilon"),
         confidence=confidence,
+        n=len(worlds[0]),
     )
+
+
+def audit_coins(
+    scores: npt.ArrayLike, coins: npt.ArrayLike, claim: Claim, confidence: float = 0.95
+) -> AuditResult:
+    """Test a claim on mu on the scores of the canaries of one run.
+
+    Args:
+        scores: (n,) log-likelihood ratios of coin 1, n >= 1; a coin is guessed by the sign.
+        coins: (n,) fair and independent coins, 0 or 1.
+        claim: the claim to test; a true one is rejected with probability 1 - confidence at most.
+        confidence: in (0, 1).
+
+    Raises:
+        ValueError: There are no scores, one is not finite, or the coins are not as many.
+    """
+    told, thrown = np.asarray(scores, dtype=np.float64), np.asarray(coins, dtype=bool)
+    require(told.ndim == 1 and told.size > 0, "scores", "one or more numbers", told.shape)
+    require(bool(np.isfinite(told).all()), "scores", "finite", told)
+    require(thrown.shape == told.shape, "coins", "as many as scores", thrown.shape)
+    risk = 1.0 - inside("confidence", confidence, 0.0, 1.0)
+    rate = float(error_bound(np.count_nonzero((told > 0.0) != thrown), told.size, risk))
+    bound = LowerBound(max(-2.0 * float(ndtri(rate)), 0.0), 0.0, rate, rate)
+    return AuditResult(claim, bound, None, confidence, told.size)
 
 
 def error_bound(errors: npt.ArrayLike, trials: int, risk: float) -> FloatArray:
@@ -164,29 +223,39 @@ def error_bound(errors: npt.ArrayLike, trials: int, risk: float) -> FloatArray:
     return bounds
 
 
-def rejection_probability(mu: float, claimed_mu: float, n: int, confidence: float = 0.95) -> float:
+def rejection_probability(
+    mu: float, claimed_mu: float, n: int, confidence: float = 0.95, *, is_one_run: bool = False
+) -> float:
     """Power of an audit: probability that it rejects a claim on mu when the truth is `mu`.
 
     The truth is a Gaussian release that the adversary scores by its likelihood ratio, and the
     threshold is the optimal one, midway. Both error counts are then binomial, and the sum over them
     is exact. `audit` has to find its threshold first, on half of the n runs per world, which
     reduces the power by a few hundredths where it is neither near 0 nor near 1. At `mu` =
-    `claimed_mu` it is the probability of a false alarm.
+    `claimed_mu` it is the probability of a false alarm. In one run there are n canaries.
     """
     mu, claimed_mu = positive("mu", mu), positive("claimed_mu", claimed_mu)
-    n = integer("n", n, 2)
+    n = integer("n", n, 1 if is_one_run else 2)
+    risk = 1.0 - inside("confidence", confidence, 0.0, 1.0)
+    rate = float(ndtr(-0.5 * mu))
+    if is_one_run:
+        bounds = error_bound(np.arange(n + 1), n, risk)
+        return float(binom.cdf(np.count_nonzero(-2.0 * ndtri(bounds) > claimed_mu) - 1, n, rate))
     trials = n - n // 2
-    risk = (1.0 - inside("confidence", confidence, 0.0, 1.0)) / _N_RATES
     counts = np.arange(trials + 1)
     # Decreases in the number of errors; the two worlds' values add up to the bound on mu.
-    evidence = -ndtri(error_bound(counts, trials, risk))
+    evidence = -ndtri(error_bound(counts, trials, risk / _N_RATES))
     most = np.searchsorted(-evidence, evidence - claimed_mu) - 1
-    rate = float(ndtr(-0.5 * mu))
     return float(np.sum(binom.pmf(counts, trials, rate) * binom.cdf(most, trials, rate)))
 
 
 def detectable_mu(
-    claimed_mu: float, n: int, confidence: float = 0.95, probability: float = 0.95
+    claimed_mu: float,
+    n: int,
+    confidence: float = 0.95,
+    probability: float = 0.95,
+    *,
+    is_one_run: bool = False,
 ) -> float:
     """Smallest true mu at which `rejection_probability` reaches the given probability.
 
@@ -195,7 +264,8 @@ def detectable_mu(
     probability = inside("probability", probability, 0.0, 1.0)
 
     def excess(mu: float) -> float:
-        return rejection_probability(mu, claimed_mu, n, confidence) - probability
+        power = rejection_probability(mu, claimed_mu, n, confidence, is_one_run=is_one_run)
+        return power - probability
 
     low = high = claimed_mu
     while excess(high) < 0.0:

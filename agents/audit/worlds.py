@@ -1,16 +1,17 @@
-"""Two adjacent worlds: one record of the other vehicles, and two trajectories of one vehicle."""
+"""Adjacent worlds: one record of the other vehicles, and trajectories of added ones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from dptse_env.config import EnvConfig
 from dptse_env.traffic import Corridor, Penetration, Record, RecordLibrary
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +53,43 @@ class Trajectory:
         return Trajectory(self.step[rows], self.segment[rows], self.speed[rows])
 
 
-class AdjacentWorlds(RecordLibrary):
-    """A library of two records that differ in one vehicle: world 0 under seed 0, world 1 under 1.
+class Worlds(RecordLibrary):
+    """A library of records that differ in vehicles added to one traffic; their seeds count them.
 
-    The other vehicles move in both as they do in ``rest``; nothing is simulated again.
+    The other vehicles move in all of them as they do in ``rest``; nothing is simulated again.
 
     Attributes:
         rest: The other vehicles.
+        added: The trajectories that are added in each record.
+        pairs: Seeds of the two worlds between which an adversary has to decide by the transcript
+            of each record, shape (n, 2).
+    """
+
+    def __init__(
+        self, rest: Record, added: Sequence[Sequence[Trajectory]], pairs: npt.ArrayLike
+    ) -> None:
+        """Add the vehicles to the rest."""
+        super().__init__()
+        self.rest, self.added, self.pairs = rest, added, np.asarray(pairs, dtype=np.int64)
+        self._records = [_add(rest, vehicles) for vehicles in added]
+
+    def __reduce__(self) -> tuple[type[Worlds], tuple[Any, ...]]:
+        """Pickle with the records, which no folder has."""
+        return type(self), (self.rest, self.added, self.pairs)
+
+    def get(self, corridor: Corridor, seed: int) -> Record:
+        """Return the record of a world."""
+        return self._records[seed]
+
+    def missing(self, corridor: Corridor, seeds: Iterable[int]) -> list[int]:
+        """Return nothing: no world is ever missing."""
+        return []
+
+
+class AdjacentWorlds(Worlds):
+    """Two records that differ in one vehicle: world 0 under seed 0, world 1 under seed 1.
+
+    Attributes:
         trajectories: The vehicle in either world.
         description: The difference in words.
     """
@@ -67,32 +98,24 @@ class AdjacentWorlds(RecordLibrary):
         self, rest: Record, trajectories: tuple[Trajectory, Trajectory], description: str = ""
     ) -> None:
         """Add the vehicle to the rest."""
-        super().__init__()
-        self.rest, self.trajectories, self.description = rest, trajectories, description
-        self._records = tuple(_add(rest, each) for each in trajectories)
+        super().__init__(rest, [[each] for each in trajectories], [[0, 1], [0, 1]])
+        self.trajectories, self.description = trajectories, description
 
     def __reduce__(self) -> tuple[type[AdjacentWorlds], tuple[Any, ...]]:
-        """Pickle with the records, which no folder has."""
+        """See `Worlds`."""
         return type(self), (self.rest, self.trajectories, self.description)
 
-    def get(self, corridor: Corridor, seed: int) -> Record:
-        """Return the record of a world."""
-        return self._records[seed]
 
-    def missing(self, corridor: Corridor, seeds: Iterable[int]) -> list[int]:
-        """Return nothing: neither world is ever missing."""
-        return []
-
-
-def _add(rest: Record, added: Trajectory) -> Record:
-    """Return a record with another vehicle; the vehicle has the next free index."""
-    columns = {
-        "step": added.step,
-        "vehicle": np.full(len(added.step), rest.n_vehicles),
-        "segment": added.segment,
-        "speed": added.speed,
+def _add(rest: Record, added: Sequence[Trajectory]) -> Record:
+    """Return a record with further vehicles, which have the next free indices."""
+    indices = rest.n_vehicles + np.arange(len(added))
+    columns: dict[str, list[AnyArray]] = {
+        "step": [each.step for each in added],
+        "vehicle": [np.repeat(indices, [len(each.step) for each in added])],
+        "segment": [each.segment for each in added],
+        "speed": [each.speed for each in added],
     }
-    joined = {name: np.concatenate([getattr(rest, name), rows]) for name, rows in columns.items()}
+    joined = {name: np.concatenate([getattr(rest, name), *rows]) for name, rows in columns.items()}
     order = np.argsort(joined["step"], kind="stable")
     ordered = {name: column[order] for name, column in joined.items()}
     return Record(**ordered, n_steps=rest.n_steps, n_columns=rest.n_columns)
@@ -100,29 +123,29 @@ def _add(rest: Record, added: Trajectory) -> Record:
 
 @dataclass(frozen=True)
 class AuditedPenetration(Penetration):
-    """A penetration under which two worlds differ in one vehicle alone, which is connected.
+    """A penetration under which worlds differ in the added vehicles alone, which are connected.
 
     The worlds have traffic seeds of their own and yet the same vehicles, so that what is drawn for
     them must not depend on the seed.
 
     Attributes:
-        target: Index of the vehicle in which the worlds differ.
+        first: Index of the first added vehicle.
     """
 
-    target: int = 0
+    first: int = 0
 
     def _uniform(self, traffic_seed: int, stream: int, n: int) -> FloatArray:
-        """Return the numbers of the one traffic; the target's lies below every share."""
+        """Return the numbers of the one traffic; those of added vehicles lie below every share."""
         uniform = super()._uniform(0, stream, n)
-        if self.target < n:
-            uniform[self.target] = 0.0
+        uniform[self.first :] = 0.0
         return uniform
 
 
-def audited(config: EnvConfig, worlds: AdjacentWorlds) -> EnvConfig:
-    """Return a configuration under which the vehicle in which two worlds differ is connected."""
+def audited(config: EnvConfig, worlds: Worlds) -> EnvConfig:
+    """Return a configuration with the worlds for traffic, whose added vehicles are connected."""
+    config = replace(config, traffic_seeds=tuple(range(len(worlds.pairs))))
     if config.penetration.is_complete:
         return config
     given = {each.name: getattr(config.penetration, each.name) for each in fields(Penetration)}
-    target = worlds.rest.n_vehicles
-    return replace(config, penetration=AuditedPenetration(**given, target=target))
+    penetration = AuditedPenetration(**given, first=worlds.rest.n_vehicles)
+    return replace(config, penetration=penetration)

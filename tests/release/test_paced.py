@@ -2,8 +2,8 @@
 
 No two trips are told apart by more than mu under ledgers, whatever is public. That holds surely and
 is tested without noise: for any queries, prices and centres, two records that differ in one vehicle
-have sums that are never further apart than mu, in units of the noise. Each way of getting it wrong
-is kept as a mutant that breaks the bound; those that look where they must not are in
+have sums that are never further apart than mu, in units of the noise. Ways of getting it wrong are
+mutants (``tests/mutants.py``); those that look where they must not are in
 ``tests/test_non_interference.py``.
 """
 
@@ -22,6 +22,7 @@ from dptse_env.release.noise import Noise
 from tests.helpers import AWAY, record
 
 from .worlds import (
+    BOTH,
     COLUMNS,
     LENGTH,
     LIMIT,
@@ -29,7 +30,6 @@ from .worlds import (
     SEGMENTS,
     TWO_GROUPS,
     WHOLE,
-    PlainLedgers,
     Public,
     T,
     Worlds,
@@ -110,17 +110,18 @@ def test_noise_is_that_of_the_prices_on_a_grid_that_is_as_public():
 
 
 def test_a_second_episode_is_released_like_the_first():
-    """No ledger, price or account outlasts a reset."""
-    release = started(Worlds(crowd()), epsilon=0.5)
+    """No ledger, price or account of either of two episodes outlasts a reset."""
+    release = started(Worlds(crowd(), crowd(seed=1)), epsilon=0.5)
     told = []
     for _ in range(2):
-        release.reset(ONE, streams(3))
+        release.reset(BOTH, streams(3, 4))
         assert not release.prices.any()
-        assert not np.concatenate([*release.spent(ONE, ONE), release.budgets_spent(ONE)]).any()
-        assert not release.private(ONE, ONE)["n_refused"].any()
-        rounds = [release.release(request(second)) for second in np.tile(ROUNDS, 3).tolist()]
+        assert not np.concatenate([*release.spent(BOTH, BOTH), release.budgets_spent(BOTH)]).any()
+        assert not release.private(BOTH, BOTH)["n_refused"].any()
+        asked = [request(second, episodes=BOTH) for second in np.tile(ROUNDS, 3).tolist()]
+        rounds = [release.release(each) for each in asked]
         values = [np.concatenate([each.values, each.sigma]) for each in rounds]
-        told.append((values, release.ledgers.paid.copy(), release.private(ONE, ONE)["n_refused"]))
+        told.append((values, release.ledgers.paid.copy(), release.private(BOTH, BOTH)["n_refused"]))
     for first, second in zip(*told, strict=True):
         np.testing.assert_array_equal(first, second)
         assert np.any(first)
@@ -223,6 +224,14 @@ def test_a_part_of_the_budget_is_kept_back_for_rounding(adjacency):
     assert counts == [1.0, 1.0, 1.0, 0.0]
     (offered,) = release.pacing.budget
     assert offered < release.ledgers.budget[0] < release.budget[0]
+
+
+def test_more_payments_than_the_reserve_covers_are_refused(monkeypatch):
+    """A vehicle may pay every query of its segment in every second."""
+    monkeypatch.setattr("dptse_env.privacy.gaussian.MOST_PAYMENTS", 3 * T)
+    WANDERER.release(PacedSettings(), spans=(1, 2), bandwidth=6)
+    with pytest.raises(ValueError, match=r"^horizon must be shorter: .* 24 times .*48 payments"):
+        WANDERER.release(PacedSettings(), spans=(1, 2, 3), bandwidth=6)
 
 
 # --- the account, and the report ---------------------------------------------------------------
@@ -380,73 +389,6 @@ def test_made_up_trips_reach_the_whole_of_mu(first, second, wish, options):
     asked, worlds = PacedSettings(clip=LIMIT / 2, **wish), Worlds(first, second)
     price = exhausting(worlds, asked, **options)
     assert 0.999 < reached(worlds, asked, price, **options) <= 1.0
-
-
-# --- mutants -------------------------------------------------------------------------------------
-
-REPLACE, ADD = (PacedSettings(clip=25.0, adjacency=which) for which in ("replace", "add_remove"))
-
-
-def queue(first):
-    """Vehicle 0, if there, stands on segment 1 for the first half; vehicle 1 for the second."""
-    early = np.arange(T + 1) <= T // 2
-    places = np.where([early & first, ~early], 1, AWAY)
-    places[:, 0] = AWAY
-    return record(places, np.zeros((2, T + 1)))
-
-
-MOVES, SENSED = drives(np.arange(T) % 4, 0.0), drives(np.repeat([2, 1], T // 2), 0.0)
-PAID = PlainLedgers.cost
-CLIPPED = PlainLedgers.told
-MUTANTS = {
-    "a ledger for each segment": (
-        {"account": lambda _, vehicle, place, column: (vehicle, place)},
-        ADD, {}, MOVES, NOBODY, 3.9,
-    ),
-    "a ledger for each query": (
-        {"account": lambda _, vehicle, place, column: (vehicle, column)},
-        ADD, OVERLAPPING, MOVES, NOBODY, 2.5,
-    ),
-    "a ledger that vehicles share": (
-        {"account": lambda _, vehicle, place, column: place},
-        ADD, {}, queue(True), queue(False), 1.9,
-    ),
-    "sensors that are not charged": (
-        {"cost": lambda own, price, raw, column, nth: PAID(own, price, raw, column, nth)
-         * (column != 2)},
-        ADD, {}, SENSED, NOBODY, 1.9,
-    ),
-    "overlaps charged once": (
-        {"cost": lambda own, price, raw, column, nth: PAID(own, price, raw, column, nth)
-         * (nth == 0)},
-        ADD, OVERLAPPING, STANDS, NOBODY, 4.9,
-    ),
-    "released at the unclipped deviation": (
-        {"told": lambda _, raw: raw,
-         "cost": lambda own, price, raw, column, nth: price
-         * (1.0 + own.ratio * (CLIPPED(own, raw) / own.clip) ** 2)},
-        ADD, {}, STANDS, NOBODY, 2.5,
-    ),
-    "charged for the count alone": (
-        {"cost": lambda _, price, raw, column, nth: price}, ADD, {}, STANDS, NOBODY, 1.9,
-    ),
-    "the budget of add_remove under replace": (
-        {"cost": lambda own, price, raw, column, nth: 0.5 * PAID(own, price, raw, column, nth)},
-        REPLACE, {}, STANDS, stays(3, 0.0), 1.9,
-    ),
-}  # fmt: skip
-"""Mistakes of ledgers, worlds that show them, and the part of mu^2 that they reach at least."""
-
-
-@pytest.mark.parametrize(
-    ("wrong", "asked", "options", "first", "second", "least"), MUTANTS.values(), ids=MUTANTS
-)
-def test_wrong_ledgers_exceed_mu(wrong, asked, options, first, second, least):
-    """At a price that uses a correct ledger up in a second."""
-    worlds, kind = Worlds(first, second), type("Wrong", (PlainLedgers,), wrong)
-    price = exhausting(worlds, asked, within=1, **options)
-    assert reached(worlds, asked, price, ledgers=kind, **options) > least
-    assert 0.7 < reached(worlds, asked, price, ledgers=PlainLedgers, **options) <= 1.0
 
 
 def test_a_ratio_above_one_exceeds_mu_under_replace():

@@ -57,6 +57,25 @@ def test_the_paced_ledger_is_attacked_with_the_estimator_of_the_environment(fact
     assert found["privacy"]["void_reasons"] == []
 
 
+@pytest.mark.parametrize(
+    ("privacy", "factor", "verdict"),
+    [
+        ({"preset": "paper", "epsilon": 1.0}, 1.0, "rejected"),
+        (CAPPED, 1.0, "not rejected"),
+        (CAPPED, 0.4, "rejected"),
+    ],
+)
+def test_one_run_says_the_same(privacy, factor, verdict, tmp_path, capsys):
+    name, found = run(tmp_path, privacy, one_run=True, runs=5000, noise_factor=factor)
+    assert name.startswith(f"{privacy['preset']}-one-run")
+    assert found["verdict"] == verdict
+    assert found["result"]["epsilon"] is None
+    assert (found["result"]["mu"]["value"] > found["result"]["claim"]["mu"]) == (
+        verdict == "rejected"
+    )
+    assert f"{found['result']['n']} canaries" in capsys.readouterr().out
+
+
 def test_every_argument_arrives(tmp_path):
     privacy = {**CAPPED, "delta": 0.01, "adjacency": "add_remove"}
     arguments = {"runs": 10, "target": "deleted", "policy": "adaptive", "confidence": 0.9}
@@ -64,7 +83,7 @@ def test_every_argument_arrives(tmp_path):
     assert name == "capped-deleted-adaptive.json"
     assert found["result"]["claim"]["delta"] == 0.01
     assert found["result"]["confidence"] == 0.9
-    assert found["n_runs"] == 10
+    assert found["result"]["n"] == 10
     # 10 runs prove nothing, and that is said.
     assert found["detectable_mu"] is None
     assert found["arguments"]["traffic_seed"] == "1"
@@ -83,6 +102,7 @@ def test_every_argument_arrives(tmp_path):
         ({"runs": 1}, "runs"),
         ({"noise_factor": 0.0}, "noise_factor"),
         ({"confidence": 1.0}, "confidence"),
+        ({"one_run": True, "runs": 5000, "target": "deleted"}, "target"),
         ({"privacy": {"preset": "paced", "cap": 9}}, r"privacy\.cap"),
     ],
 )

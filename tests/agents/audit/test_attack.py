@@ -245,6 +245,3 @@ def test_what_cannot_be_audited_is_refused(record):
     worlds = AdjacentWorlds(record, (staying(1), staying(3)))
     with pytest.raises(ValueError, match=r"a release model with Gaussian noise.*Silent"):
         runs_of(config(preset=Silent), worlds, policy=np.ones((HORIZON, 6), dtype=bool))
-    spans = dataclasses.replace(paced(), query_spans=(1, 2))
-    with pytest.raises(ValueError, match=r"query_spans must be \(1,\)"):
-        attacked_form(spans)

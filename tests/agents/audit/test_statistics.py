@@ -7,6 +7,7 @@ from scipy.stats import binom, binomtest, norm
 from agents.audit.statistics import (
     Claim,
     audit,
+    audit_coins,
     detectable_mu,
     error_bound,
     rejection_probability,
@@ -44,6 +45,37 @@ def test_a_true_claim_is_rarely_rejected(mu):
     assert rejected <= 18
     # The bound lies close below the truth, by the width of its own confidence interval.
     assert np.median([result.mu.value for result in results]) > mu - 0.4
+
+
+def one_run(mu, n, seed, claimed=None):
+    """The finding on n canaries at a distance of mu."""
+    scores, coins = gaussian_scores(mu, n, seed), np.random.default_rng((1, seed))
+    thrown = coins.integers(2, size=n)
+    return audit_coins(scores[thrown, np.arange(n)], thrown, claim_at(claimed or mu))
+
+
+@pytest.mark.parametrize(("mu", "n"), [(0.75, 30), (2.118, 20), (2.118, 115)])
+def test_the_bound_of_one_run_covers(mu, n):
+    bounds = np.array([one_run(mu, n, seed).mu.value for seed in range(1_000)])
+    # At most 5 % in truth: more than 72 of 1,000 then have probability 0.1 %.
+    assert np.count_nonzero(bounds > mu) <= 72
+    assert np.median(bounds) > mu - 6.0 / math.sqrt(n)
+
+
+@pytest.mark.parametrize(("mu", "n"), [(1.5, 60), (2.0, 40)])
+def test_the_power_of_one_run_is_its_rate_of_rejection(mu, n):
+    rejected = [one_run(mu, n, seed, claimed=0.75).verdict == "rejected" for seed in range(1_000)]
+    power = rejection_probability(mu, 0.75, n, is_one_run=True)
+    assert 0.1 < power < 0.99
+    assert np.mean(rejected) == pytest.approx(power, abs=4.0 * math.sqrt(0.25 / 1_000))
+    least = detectable_mu(0.75, n, is_one_run=True)
+    assert rejection_probability(least, 0.75, n, is_one_run=True) == pytest.approx(0.95, abs=1e-3)
+
+
+def test_few_canaries_reject_nothing():
+    # Even without an error at 10 of them, a rate of 26 % is possible.
+    assert one_run(20.0, 10, 0, claimed=2.118).verdict == "not rejected"
+    assert detectable_mu(2.118, 10, is_one_run=True) == math.inf
 
 
 def test_the_bounds_rest_on_held_out_runs():
@@ -158,6 +190,19 @@ def test_detectable_mu_is_where_power_reaches_its_mark():
 def test_bad_scores_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         audit(*arguments, claim_at(1.0))
+
+
+@pytest.mark.parametrize(
+    ("scores", "coins", "message"),
+    [
+        ([], [], "scores must be one or more numbers"),
+        ([1.0, 2.0], [0], "coins must be as many as scores"),
+        ([1.0, np.inf], [0, 1], "scores must be finite"),
+    ],
+)
+def test_bad_canaries_are_named(scores, coins, message):
+    with pytest.raises(ValueError, match=message):
+        audit_coins(scores, coins, claim_at(1.0))
 
 
 @pytest.mark.parametrize(
