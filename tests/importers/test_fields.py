@@ -159,7 +159,7 @@ def test_speeds_in_metres_a_second_are_told_in_light_traffic_alone(tmp_path):
             "density",
             0.02,
             0.3,
-            r"likely veh/km or veh/mi, got 'veh/ft': 1 % of cells are above 800",
+            r"likely veh/m, .*: 1 % of cells are above 800 v",
         ),
     ],
 )
