@@ -46,14 +46,14 @@ class FieldScore(NamedTuple):
     chi2_speed: float
 
 
-def read_field(source: FieldSource, segments: int) -> Field:
+def read_field(source: FieldSource, segments: int, lanes: int, speed_limit: float) -> Field:
     """Read a field, averaged over `segments` + 2 segments and interpolated to seconds.
 
     Raises:
-        ValueError: A file is malformed, or there are fewer cells than segments.
+        ValueError: A file is malformed or of another unit, or there are fewer cells than segments.
         OSError: A file cannot be read.
     """
-    density, flow = source.read()
+    density, flow = source.read(lanes, speed_limit)
     each = len(density) // (segments + 2)
     if each < 1:
         raise ValueError(f"segments must be at most {len(density) - 2}, got {segments}")

@@ -21,6 +21,8 @@ from stable_baselines3 import PPO
 
 from benchmarks.turns import Line, Work, compare, make_batch, stepping, take_turns
 from dptse_env.config import resolve
+from dptse_env.parts import make_task
+from dptse_env.release.noise import Noise, NoiseSource
 from dptse_env.sb3 import SB3VecEnv
 from dptse_env.traffic import RecordLibrary, draw_scenario
 from dptse_env.traffic.sumo import running
@@ -53,6 +55,8 @@ def measure(*, quick: bool = False) -> list[Line]:
         work[f"batch of {n:,}, PrivateHighway"] = stepping(
             make_batch(PRIVATE, n, **keywords), steps
         )
+        for source in ("seeded", "secure"):
+            work[f"{source} noise, batch of {n:,}, PrivateHighway"] = noise(source, n, steps)
         work[f"PPO, batch of {n:,}"] = learning(n, steps, keywords)
         times = take_turns(work, rounds)
     base = f"batch of {n:,}"
@@ -146,6 +150,22 @@ def repeating(
             if np.all(truncated):
                 reset()
         return len(actions) * n
+
+    return turn
+
+
+def noise(source: NoiseSource, n: int, n_steps: int) -> Work:
+    """Return work that draws the noise of a batch's releases, and adds it."""
+    task = make_task(resolve("private-highway", {}))
+    shape = n, task.n_columns, 2
+    episodes, values, sigma = np.arange(n), np.zeros(shape), np.full(shape, 5.0)
+    drawn = Noise(n, task.n_columns, source)
+    drawn.reset(episodes, [np.random.default_rng(episode) for episode in range(n)])
+
+    def turn() -> int:
+        for _ in range(n_steps):
+            drawn.added(episodes, values, sigma, task.length)
+        return n * n_steps
 
     return turn
 

@@ -43,9 +43,11 @@ from dptse_env.traffic import (
     read_road,
 )
 from dptse_env.traffic.imported import has_vehicles, recorded_seeds, require_seeds
+from dptse_env.traffic.roads import RoadFile
 from dptse_env.utils.fields import (
     Interval,
     checked_fields,
+    cut,
     field_hints,
     from_mapping,
     require,
@@ -307,8 +309,43 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
             values that were measured or tuned for others, or assumed, are used.
     """
     require_name("preset", preset, PRESETS)
-    base, corridor = PRESETS[preset], overrides.get("corridor")
+    corridor = overrides.get("corridor")
     road = read_road(corridor) if is_road_file(corridor) else None
+    try:
+        config, inherited = _resolve(PRESETS[preset], overrides, road)
+    except ValueError as problem:
+        raise _of_file(problem, overrides, road) from problem
+    if inherited and not config.inherited:
+        config = replace(config, inherited=inherited)
+        warnings.warn(
+            f"{', '.join(inherited)}: values measured or tuned on {PRESETS[preset].corridor.name}, "
+            "or assumed, are used on another road or with other parameters; give them to use "
+            "others",
+            UserWarning,
+            stacklevel=3,
+        )
+    return config
+
+
+def _of_file(
+    problem: ValueError, overrides: Mapping[str, Any], road: RoadFile | None
+) -> ValueError:
+    """Return an error with the road file in front where the value that it names comes from it."""
+    if road is None:
+        return problem
+    own = [key for key in road.environment if key not in overrides]
+    places = [(path, "environment.") for key in own for path in (key, _SHORTCUTS.get(key, key))]
+    for path, table in (*places, ("corridor", "")):
+        if str(problem).startswith(cut(path)):
+            return type(problem)(f"{overrides['corridor']}: {table}{problem}")
+    return problem
+
+
+def _resolve(
+    base: EnvConfig, overrides: Mapping[str, Any], road: RoadFile | None
+) -> tuple[EnvConfig, tuple[str, ...]]:
+    """Return a configuration, and the keywords that it inherits from another road."""
+    corridor = overrides.get("corridor")
     values = {**road.environment, **overrides, "corridor": road.corridor} if road else {**overrides}
     _check_keywords(values)
     estimator = values.get("estimator", base.estimator)
@@ -330,16 +367,7 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         expected = settings_type(config.estimator)
         settings = from_mapping(expected, changes, "estimator_settings", config.settings())
         config = replace(config, estimator_settings=settings)
-    inherited = _inherited(corridor, config, given, road.assumed if road else ())
-    if inherited and not config.inherited:
-        config = replace(config, inherited=inherited)
-        warnings.warn(
-            f"{', '.join(inherited)}: values measured or tuned on {base.corridor.name}, or "
-            "assumed, are used on another road or with other parameters; give them to use others",
-            UserWarning,
-            stacklevel=3,
-        )
-    return config
+    return config, _inherited(corridor, config, given, road.assumed if road else ())
 
 
 def _read_seeds(values: dict[str, Any], corridor: Corridor) -> None:
@@ -380,7 +408,11 @@ def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:
     return tuple(seeds)
 
 
-_SHORTCUTS = ("epsilon", "delta", "incident", "demand")
+_SHORTCUTS = {
+    "epsilon": "privacy.epsilon", "delta": "privacy.delta", "incident": "corridor.incident",
+    "demand": "corridor.demand",
+}  # fmt: skip
+"""Keywords that stand for a field of another one."""
 
 
 def _check_keywords(values: Mapping[str, Any]) -> None:
@@ -388,8 +420,8 @@ def _check_keywords(values: Mapping[str, Any]) -> None:
     for key in values:
         if key not in known:
             raise UnknownKeywordError(
-                f"{key} is unknown; allowed: {', '.join(known)} (got an unexpected keyword "
-                f"argument {key!r})"
+                f"{cut(key)} is unknown; allowed: {', '.join(known)} (got an unexpected keyword "
+                f"argument {shown(key)})"
             )
 
 

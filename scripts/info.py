@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import dptse_env
+from dptse_env.privacy import DELTAS, over_trips
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.threads import n_cores
@@ -31,6 +32,8 @@ PACKAGES = (
 class Args:
     """Print versions, machine and caches."""
 
+    mu: float | None = None
+    """Print, in place of them, what trips of one vehicle reveal together, each of this mu."""
     json: bool = False
     """Print JSON, for a program."""
 
@@ -70,9 +73,12 @@ def installed(package: str) -> str | None:
 
 def main(args: Args) -> None:
     """Print."""
-    found = collect()
+    found: dict[Any, Any] = collect() if args.mu is None else over_trips(args.mu)
     if args.json:
         print(json.dumps(found, indent=2))
+        return
+    if args.mu is not None:
+        _print_trips(found)
         return
     packages = found.pop("packages")
     records, ids = found.pop("records"), found.pop("environments")
@@ -82,3 +88,10 @@ def main(args: Args) -> None:
     print(f"{'environments':<18} {', '.join(ids)}")
     for name, version in packages.items():
         print(f"{name:<18} {version or 'not installed'}")
+
+
+def _print_trips(account: dict[int, dict[str, float]]) -> None:
+    print(f"trips       mu  epsilon at delta = {'      '.join(DELTAS)}")
+    for trips, row in account.items():
+        epsilons = "".join(f"{row[delta]:10.1f}" for delta in DELTAS)
+        print(f"{trips:5} {row['mu']:8.3f}{'':15}{epsilons}")

@@ -60,7 +60,7 @@ def main(args: Args) -> None:
     require(bool(configs), "estimators", "one or more", args.estimators)
     base = configs[0]
     require(base.privacy.preset == "corrected", "privacy", "'corrected'", base.privacy.preset)
-    measured = read_field(args.source, args.segments)
+    measured = read_field(args.source, args.segments, args.lanes, args.speed_limit)
     corridor = field_corridor(measured, args.lanes, args.speed_limit)
     replay = Replay(
         measured,

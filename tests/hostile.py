@@ -1,4 +1,7 @@
-"""Files made to mislead, or to cost time and memory: kinds of damage to any file with a card."""
+"""Values and files made to mislead, or to cost time and memory, and checks of what is said then.
+
+Damage is to any file with a card, or to any text. `tests/fuzz.py` draws it at random.
+"""
 
 import copy
 import json
@@ -17,6 +20,84 @@ from dptse_env.utils.files import LARGEST_FILE, content_digest, read_tensors
 
 ADDITIONAL = 128 * 2**20
 """Bytes that reading may take beyond those of the imports and of first, good files."""
+
+
+def nested(levels, value=()):
+    """A list in a list in a list ..."""
+    for _ in range(levels):
+        value = [value]
+    return value
+
+
+ODD = (
+    None, True, -1, 0, 2**63, 10**5000, 0.0, 5e-324, 1e308, float("nan"), float("inf"), "", "a\nb",
+    "x" * 10_000, "no_such_module:Part", "none.json", "\0", b"1", (), {}, {"a": {"b": 1}}, {1: 2},
+    nested(200), [0] * 200_000, [[]], object(),
+)  # fmt: skip
+"""Values that few fields may have, or none."""
+
+TOKENS = (
+    b"9" * 5000, b"1e999", b"-1e999", b"nan", b"inf", b"-1", b"0", b"5e-324", b"1e308", b"1e9",
+    b"99999999999999999999", b'"', b'""', b'"a\\nb"', b'"no_such_module:Part"', b"'", b"[" * 3000,
+    b"{" * 3000, b'{"a":' * 3000, b"]", b"}", b"=", b",", b"<", b"null", b"true", b"x" * 10_000,
+    b"\0", b"\xff\xfe", b"\r", b"\n", b"", b"1", b"2", b"3", b"7.5", b"0.2", b"100", b"true",
+    b"1", b"2", b"0.5", b"60",
+)  # fmt: skip
+"""What takes the place of a word of a text, or a few bytes of it; some of it may be in order."""
+
+
+def changed(content, rng):
+    """A text with some damage at a random place."""
+    place = int(rng.integers(len(content)))
+    token = TOKENS[rng.integers(len(TOKENS))]
+    lines = content.splitlines(keepends=True)
+    line = int(rng.integers(len(lines)))
+    words = [*re.finditer(rb"[-+\w.]+", content)]
+    word = words[rng.integers(len(words))]
+    match rng.integers(9):
+        case 0:
+            return content[:place]
+        case 1:
+            flipped = content[place] ^ 1 << int(rng.integers(8))
+            return content[:place] + bytes([flipped]) + content[place + 1 :]
+        case 2:
+            return content[:place] + token + content[place + int(rng.integers(4)) :]
+        case 3:
+            return b"".join([*lines[:line], *lines[line + 1 :]])
+        case 4:
+            return b"".join([*lines[:line], lines[line] * int(rng.integers(2, 300)), *lines[line:]])
+        case 5:
+            other = int(rng.integers(len(lines)))
+            lines[line], lines[other] = lines[other], lines[line]
+            return b"".join(lines)
+        case _:  # what changes a single value is the most telling
+            return content[: word.start()] + token + content[word.end() :]
+
+
+def changed_tensors(path, rng):
+    """A file of arrays with some damage at a random place: bytes, its card, or an array."""
+    content, (card, arrays) = path.read_bytes(), copy.deepcopy(read_tensors(path))
+    card.pop("sha256")
+    first = sorted(arrays)[rng.integers(len(arrays))]
+    array = arrays[first]
+    match rng.integers(4):
+        case 0:
+            kinds = [*damaged(content), *odd(card, arrays)]
+            return kinds[rng.integers(len(kinds))][1]
+        case 1:  # numbers of other sizes, in a file that is sound
+            scale = 10.0 ** rng.integers(-30, 30)
+            with np.errstate(all="ignore"):
+                return signed(card, {**arrays, first: (array * scale).astype(array.dtype)})
+        case 2:
+            changes = array[:0], array[::-1], array[None], array.astype("i8"), -array
+            return signed(card, {**arrays, first: np.ascontiguousarray(changes[rng.integers(5)])})
+        case _:
+            text = changed(json.dumps(card).encode(), rng)
+            try:
+                return signed(json.loads(text), arrays)
+            except (ValueError, TypeError, AttributeError, RecursionError):
+                # No card that could be signed.
+                return save(arrays, {"card": text.decode(errors="replace")})
 
 
 def signed(card, arrays):
@@ -112,8 +193,8 @@ def odd(card, arrays):
 
 
 @contextmanager
-def little_memory():
-    """Leave this process no more than `ADDITIONAL` bytes of further memory, where Linux runs."""
+def little_memory(additional=ADDITIONAL):
+    """Leave this process no more than so many bytes of further memory, where Linux runs."""
     size = Path("/proc/self/statm")
     if not size.exists():  # the others cannot say what a process has, or limit it
         yield
@@ -121,7 +202,7 @@ def little_memory():
     import resource
 
     before = resource.getrlimit(resource.RLIMIT_AS)
-    limit = int(size.read_text().split()[0]) * resource.getpagesize() + ADDITIONAL
+    limit = int(size.read_text().split()[0]) * resource.getpagesize() + additional
     resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
     try:
         yield

@@ -1,12 +1,24 @@
-"""The environment under presets that guarantee privacy: account, warnings, truth."""
+"""The environment under presets that guarantee privacy: account, warnings, truth, distances."""
 
+import dataclasses
 import json
+import math
+from fractions import Fraction
+from functools import cache
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from tests.helpers import make_env, play
+from dptse_env.config import EnvConfig
+from dptse_env.estimators import Estimate
+from dptse_env.parts import make_parts, make_release
+from dptse_env.privacy import ROUNDING, mu_of
+from dptse_env.process import QueryProcess
+from dptse_env.release import CappedSettings, Detectors, PacedSettings, Pacing, Request
+from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
+from tests.helpers import AWAY, fast_and_slow, make_env, play, record
+from tests.release.worlds import ONE, Worlds
 
 CAPPED, PACED = {"preset": "capped", "cap": 5}, {"preset": "paced", "epsilon": 0.5}
 
@@ -87,3 +99,329 @@ def test_a_spec_with_every_keyword_of_paced_ledgers_survives_json():
     env = gym.make("dptse_env:dptse/PrivateHighway-v1", **given)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config == env.unwrapped.config
+
+
+# --- no two worlds are further apart than mu ------------------------------------------------------
+#
+# A process plays an episode of one world. An eavesdropper has noiseless copies of its release model
+# in both, which are told the same queries and predictions: what they would have added noise to are
+# the true sums. Their distance, in units of the noise, is a fraction without any rounding.
+
+HORIZON, DURATION = 30, 33
+COMMON = 4
+"""Traffic seed of a record that both worlds have. Theirs are 0 and 1; in 2 and 3 the vehicle that
+differs is alone."""
+ROAD = dataclasses.replace(SHORT_HIGHWAY, duration=DURATION, incident=None)
+PLACES = ROAD.n_segments + ROAD.n_boundaries
+ESTIMATORS = ("ekf", "random_walk", "recurrent", "ukf", "enkf", "mhe")
+
+
+class Reckless(Pacing):
+    """Prices from far too low to the whole budget at once, by the second and the column."""
+
+    def reset(self, episodes):
+        self.second = 0
+
+    def prices(self, episodes, observed, density, speed):
+        self.second += 1
+        powers = np.random.default_rng(self.second).choice(
+            [0.0, -0.3, -1.0, -2.0, -3.0, -6.0], observed.shape[1]
+        )
+        return np.tile(self.budget[self.task.group] * 10.0**powers, (len(observed), 1))
+
+
+@dataclasses.dataclass(frozen=True)
+class Known(Penetration):
+    """Half of the vehicles are connected, in every world the same but for the first of them.
+
+    Attributes:
+        worlds: Whether the first is connected in either world.
+    """
+
+    worlds: tuple[bool, bool] = (True, True)
+
+    def _uniform(self, traffic_seed, stream, n):
+        uniform = super()._uniform(COMMON, stream, n)
+        if stream == 0 and traffic_seed != COMMON:
+            uniform[:1] = 0.0 if self.worlds[traffic_seed % 2] else 1.0
+        return uniform
+
+
+class Silence:
+    """In place of noise: keeps what it would be added to, and its deviations."""
+
+    def reset(self, episodes, generators):
+        """Nothing is drawn."""
+
+    def added(self, episodes, values, sigma, unit):
+        self.sums, self.sigma = values.copy(), sigma.copy()
+        return values
+
+
+class Eavesdropper:
+    """Hears every release of a process of one episode, and adds up how far two worlds are apart.
+
+    Attributes:
+        square: Squared distance of the true sums so far, in units of the noise.
+    """
+
+    def __init__(self, config, records):
+        self.process = QueryProcess(make_parts(config, library=Worlds(*records)))
+        self.copies = make_release(config, 4, self.process.traffic)
+        self.copies.noise = Silence()
+        self.process.traffic.load(np.arange(len(records)))
+        self._released = self.process.release.release
+        self.process.release.release = self._release
+
+    def begin(self, world, traffic, seed):
+        """Begin an episode of one of the two worlds; `traffic` are the records of the copies."""
+        self.square, self.traffic = Fraction(), np.array(traffic)
+        self.copies.reset(np.arange(4), [np.random.default_rng()] * 4)
+        options = {"traffic_seed": int(traffic[world])}
+        self.process.reset(ONE, [np.random.default_rng(seed)], options)
+
+    def _release(self, request):
+        made = request.prediction()
+        four = [np.repeat(each, 4, axis=0) for each in made]
+        released = self._released(request._replace(prediction=lambda: made))
+        self.copies.release(
+            Request(
+                np.arange(4),
+                self.traffic,
+                np.repeat(request.times, 4),
+                np.repeat(request.observed, 4, axis=0),
+                lambda: Estimate(*four),
+            )
+        )
+        sums, sigma = self.copies.noise.sums, self.copies.noise.sigma
+        np.testing.assert_array_equal(sigma, np.broadcast_to(sigma[:1], sigma.shape))
+        differences = np.where(released.observed[0][:, None], sums[1::2] - sums[::2], 0.0)
+        # Other vehicles cancel, bit for bit.
+        np.testing.assert_array_equal(*differences)
+        for at in zip(*np.nonzero(differences[0]), strict=True):
+            self.square += up((Fraction(differences[0][at]) / Fraction(sigma[0][at])) ** 2)
+        return released
+
+
+def up(number):
+    """A fraction, rounded up so little that it does not matter: it keeps sums of them short."""
+    return Fraction(math.ceil(number * 2**200), 2**200)
+
+
+def configuration(one_of):
+    """A configuration of a short road, of choices that a function makes."""
+    is_paced, adjacency = one_of(True, True, False), one_of("replace", "add_remove")
+    sensors, estimator = one_of((), (1,), (5, 7), (0, 1, 6)), one_of(*ESTIMATORS)
+    # The network was trained on a limit of 102 km/h, and on sums over two segments at most.
+    limit, span = (102.0, 2) if estimator == "recurrent" else (one_of(102.0, 100.7), 3)
+    given = {
+        "epsilon": one_of(0.5, 5.0, 20.0),
+        "delta": one_of(0.05, 1e-12),
+        "adjacency": adjacency,
+        "boundary_inputs": one_of("nominal", "private", "true"),
+    }
+    if is_paced:
+        privacy = PacedSettings(
+            **given,
+            unit=one_of("trip", "trip", "event"),
+            clip=one_of(7.3, 25.0, 150.0),
+            ratio=one_of(0.3, 1.0) if adjacency == "replace" else one_of(1.0, 30.0),
+            pacing=one_of("tracer", Reckless),
+        )
+        options = {
+            "query_spans": one_of((1,), (2,), (1, 2), (1, 2, 3)[:span]),
+            "price_levels": one_of((1.0,), (0.5, 4.0)),
+        }
+    else:
+        unit, cap = one_of(("trip", 7), ("trip", 1), ("horizon", 1), ("event", 1))
+        privacy = CappedSettings(**given, unit=unit, cap=cap, share=one_of(0.1, 0.5, 0.8))
+        options = {}
+    if one_of(True, False):
+        # Whether the vehicle is connected may differ, too, as it does between vehicles.
+        connected = one_of((True, True), (True, False), (False, sensors == ()))
+        worlds = connected if privacy.unit != "event" else connected[:1] * 2
+        wrong = one_of({}, {"misreporting": 0.5, "misreport_factor": 0.6})
+        options["penetration"] = Known(share=0.5, worlds=worlds, **wrong)
+    if sensors and one_of(True, False):
+        options["detectors"] = one_of(Detectors(dropout=0.3), Detectors(budget_share=0.6))
+    return EnvConfig(
+        dataclasses.replace(ROAD, fixed_sensors=sensors, speed_limit=limit),
+        estimator=estimator,
+        privacy=privacy,
+        bandwidth=one_of(1, 3, 6),
+        bandwidth_unit="sums",
+        horizon=HORIZON,
+        random_start=one_of(True, False),
+        traffic_seeds=tuple(range(COMMON + 1)),
+        **options,
+    )
+
+
+def jumps(generator, n_vehicles=1):
+    """Vehicles anywhere in every second, at speeds that deviate most, or at any."""
+    shape = n_vehicles, DURATION + 1
+    speeds = generator.choice([0.0, 51.0, 150.0, *generator.uniform(0.0, 130.0, 2)], shape)
+    return generator.integers(AWAY, PLACES, shape), speeds
+
+
+def stands(generator):
+    """A vehicle that stays where it is."""
+    place, speed = generator.integers(ROAD.n_mainline), generator.choice([0.0, 51.0, 150.0])
+    return np.full((1, DURATION + 1), place), np.full((1, DURATION + 1), speed)
+
+
+def nobody(generator, n_vehicles=1):
+    """A vehicle that is never there."""
+    return np.full((1, DURATION + 1), AWAY), np.zeros((1, DURATION + 1))
+
+
+@cache
+def simulated():
+    """The vehicles of a record of SUMO, places and speeds (V, T + 1)."""
+    whole = RecordLibrary().get(SHORT_HIGHWAY, 0)
+    places = np.full((whole.n_vehicles, whole.n_steps), AWAY)
+    speeds = np.zeros(places.shape)
+    places[whole.vehicle, whole.step] = whole.segment
+    speeds[whole.vehicle, whole.step] = whole.speed
+    return places, speeds
+
+
+def drives(generator, n_vehicles=1):
+    """Vehicles of a record of SUMO, at a time when there are some."""
+    first = generator.integers(simulated()[0].shape[1] - DURATION)
+    places, speeds = (table[:, first : first + DURATION + 1] for table in simulated())
+    there = generator.permutation(np.flatnonzero((places != AWAY).any(axis=1)))[:n_vehicles]
+    return places[there], speeds[there]
+
+
+TRIPS, OTHERS = (jumps, stands, drives), (jumps, drives, nobody)
+
+
+def adjacent_trips(config, kinds, generator):
+    """The trip of a vehicle in either world: its places and speeds, (1, T + 1) each."""
+    zero, one = (kind(generator) for kind in kinds)
+    if config.privacy.adjacency == "add_remove":
+        is_shown = getattr(config.penetration, "worlds", (True, True))
+        one = zero if is_shown[0] != is_shown[1] else nobody(generator)
+    if config.privacy.unit == "event":
+        own = np.arange(DURATION + 1) != generator.integers(1, HORIZON + 1)
+        one = tuple(np.where(own, *each) for each in zip(zero, one, strict=True))
+    return zero, one
+
+
+def records_of(trips, others, generator):
+    """Records by traffic seed: the vehicle and others, the vehicle alone, and a common one."""
+    tables = [
+        *([np.concatenate(pair) for pair in zip(trip, others, strict=True)] for trip in trips),
+        *trips, jumps(generator, 20),
+    ]  # fmt: skip
+    return [record(*table, PLACES) for table in tables]
+
+
+def plan(config, trips, likely, generator):
+    """Flags of the options that are asked in each second, (T + 1, G): where the vehicle is, or
+    some, each as likely."""
+    options = config.queries
+    asked = generator.random((DURATION + 1, options.n_options)) < likely
+    if likely == 0.0:
+        places = np.concatenate([places for places, _ in trips])
+        covers = np.pad(options.covers, [(0, 0), (0, PLACES + 1 - options.n_mainline)])
+        asked = covers[:, places].any(axis=1).T  # `AWAY` is the last column, which none covers
+    return asked.astype(np.int8)
+
+
+def distances(config, records, wanted, seed):
+    """Play episodes of either world, and of a common record; return the squares over mu^2."""
+    heard, found = Eavesdropper(config, records), []
+    process = heard.process
+    told, claimed = process.privacy()["mu"], mu_of(config.privacy.epsilon, config.privacy.delta)
+    mu = min(Fraction(told), Fraction(claimed))
+    for world, traffic in ((0, [0, 1, 2, 3]), (1, [COMMON] * 4), (1, [0, 1, 2, 3])):
+        heard.begin(world, traffic, seed)
+        for _ in range(HORIZON):
+            process.step(ONE, wanted[process.time + 1])
+            spent = process.info(0)["spent_mu"]
+            assert heard.square <= min(Fraction(spent), mu) ** 2
+            assert spent <= told
+        found.append(heard.square / mu**2)
+    assert found[1] == 0
+    return found
+
+
+FAST, SLOW = range(6), range(6, 100)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of filters that diverge, as they may
+@pytest.mark.parametrize("number", fast_and_slow([*FAST, *SLOW], FAST))
+def test_no_two_worlds_are_further_apart_than_what_is_spent(number):
+    """Eight choices of mechanism, queries, sensors, estimator and trips, and so on, each."""
+    for each in range(8):
+        generator = np.random.default_rng((number, each))
+
+        def one_of(*values, draw=generator.integers):
+            return values[draw(len(values))]
+
+        config = configuration(one_of)
+        kinds, likely = (one_of(*TRIPS), one_of(*TRIPS, nobody)), one_of(0.0, 0.3, 1.0)
+        trips = adjacent_trips(config, kinds, generator)
+        records = records_of(trips, one_of(*OTHERS)(generator, 30), generator)
+        distances(config, records, plan(config, trips, likely, generator), number)
+
+
+class AtOnce(Pacing):
+    """Prices that leave a vehicle that deviates by the clip no more than is kept back for rounding.
+
+    Then they try that, and in the end so little that a ledger does not notice.
+    """
+
+    def reset(self, episodes):
+        self.parts = iter([1.0, ROUNDING, ROUNDING])
+
+    def prices(self, episodes, observed, density, speed):
+        whole = self.budget[self.task.group] / (1.0 + self.task.settings.ratio)
+        return np.tile(next(self.parts, 2.0**-54) * whole, (len(observed), 1))
+
+
+EXIT, FAST_ONE, NOBODY = ROAD.n_segments + 1, (1, 150.0), (AWAY, 0.0)
+BOTH_SEE = {"penetration": Known(share=0.5), "detectors": Detectors(budget_share=0.6)}
+OVERLAPPING = {"query_spans": (1, 2), "price_levels": (0.5, 4.0)}
+WORST = {
+    "capped": (CappedSettings(cap=7, share=0.2), {}, (1, 0.0), FAST_ONE),
+    "capped, a second, by queries and sensors": (
+        CappedSettings(unit="event", adjacency="add_remove"), BOTH_SEE, (1, 0.0), NOBODY,
+    ),
+    "capped, every second, at the boundary": (
+        CappedSettings(unit="horizon", boundary_inputs="private"), {}, (EXIT, 0.0), (1, 0.0),
+    ),
+    "paced": (PacedSettings(pacing=AtOnce), {}, (1, 0.0), (3, 0.0)),
+    "paced, by queries and sensors": (
+        PacedSettings(pacing=AtOnce, adjacency="add_remove"), BOTH_SEE, NOBODY, (1, 0.0),
+    ),
+    "paced, a second, by overlapping queries": (
+        PacedSettings(unit="event", adjacency="add_remove"), OVERLAPPING, (1, 0.0), NOBODY,
+    ),
+}  # fmt: skip
+"""Settings, keywords, and the place and speed at which the vehicle stands in either world."""
+
+
+@pytest.mark.parametrize(("privacy", "options", "zero", "one"), WORST.values(), ids=WORST)
+def test_the_worst_trips_are_as_far_apart_as_mu_and_no_further(privacy, options, zero, one):
+    config = EnvConfig(
+        dataclasses.replace(ROAD, fixed_sensors=(1, 3)),
+        estimator="open_loop",
+        privacy=privacy,
+        bandwidth=6,
+        bandwidth_unit="sums",
+        horizon=HORIZON,
+        traffic_seeds=tuple(range(COMMON + 1)),
+        **options,
+    )
+    seconds, generator = np.arange(DURATION + 1), np.random.default_rng(0)
+    there = (seconds == 5) | (privacy.unit != "event")
+    trips = [
+        (np.where(there, place, AWAY)[None], np.full((1, seconds.size), speed))
+        for place, speed in (zero, one)
+    ]
+    records = records_of(trips, jumps(generator, 30), generator)
+    first, _, again = distances(config, records, plan(config, trips, 0.0, generator), 0)
+    assert min(first, again) > 1.0 - 1e-7

@@ -102,6 +102,29 @@ def test_an_episode_may_pause_while_others_go_on():
         np.testing.assert_array_equal(outcome.reward, expected[k].reward)
 
 
+def test_a_second_is_predicted_then_released_and_then_read():
+    """What centres and prices are taken from has not seen the release of its own second."""
+    process, order = begun(1, privacy=PAID), []
+
+    def spy(part, name):
+        called = getattr(part, name)
+
+        def noted(*args):
+            order.append(name)
+            return called(*args)
+
+        setattr(part, name, noted)
+
+    for part, name in (
+        (process.estimator, "predict"), (process.release, "release"),
+        (process.estimator, "update"),
+    ):  # fmt: skip
+        spy(part, name)
+    for action in sampled(process, 3):
+        process.step(ALL[:1], action[:1])
+    assert order == ["predict", "release", "update"] * 3
+
+
 def test_residuals_are_the_noise_that_is_declared():
     """Released minus true over sigma: unit variance, uncorrelated over time and quantities."""
     privacy = {"preset": "capped", "boundary_inputs": "private", "share": 0.3}

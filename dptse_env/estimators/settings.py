@@ -15,7 +15,15 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from dptse_env.model import ARZParameters, Bounds, available_parameters
-from dptse_env.utils.fields import Interval, check_object, checked_fields, from_mapping, read_json
+from dptse_env.utils.fields import (
+    Interval,
+    check_object,
+    checked_fields,
+    cut,
+    from_mapping,
+    read_json,
+    shown,
+)
 
 Linearisation = Literal["paper", "trajectory"]
 
@@ -262,7 +270,8 @@ def load_settings(name: str) -> EstimatorSettings:
         ValueError: There are none of this name; the message lists the available ones.
     """
     if name not in _table():
-        raise ValueError(f"{_PATH} must be one of {', '.join(available_settings())}, got {name!r}")
+        known = ", ".join(available_settings())
+        raise ValueError(f"{_PATH} must be one of {known}, got {shown(name)}")
     return _parse(_table()[name], name)
 
 
@@ -320,10 +329,10 @@ def _entry(content: Any, path: str) -> dict[str, Any]:
     """Return the entry of a file that has one."""
     if not isinstance(content, dict) or len(content) != 1:
         raise ValueError(
-            f"{path} must be a mapping with one name of settings, got {content!r:.200}"
+            f"{path} must be a mapping with one name of settings, got {shown(content)}"
         )
     ((name, entry),) = content.items()
-    return check_object(entry, f"{path}: {name}", _KEYS)
+    return check_object(entry, f"{path}: {cut(name)}", _KEYS)
 
 
 def _parse(entry: Mapping[str, Any], path: str) -> EstimatorSettings:

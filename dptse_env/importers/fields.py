@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,15 @@ from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.roads import DENSITY_SCALE, write_corridor
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.fields import integer, positive, require, require_name
+from dptse_env.utils.fields import (
+    Interval,
+    cut,
+    integer,
+    number,
+    positive,
+    require,
+    require_name,
+)
 
 UNITS = {
     "density": {f"veh/{name}": 1.0 / LENGTHS[name] for name in ("km", "mi", "ft", "m")},
@@ -35,12 +43,21 @@ UNITS = {
 """Factors to veh/km, km/h and veh/h."""
 LEAST_DENSITY = 1e-9
 """Density [veh/km] below which a cell is empty and has no speed of its own."""
-DENSEST = (1.0, 3000.0)
-"""Largest density of a field [veh/km], all lanes together, beyond which its unit is another one."""
-FASTEST = (5.0, 300.0)
-"""Largest speed of a field [km/h], beyond which its unit is another one."""
-DENSEST_LANE, BUSIEST_LANE = 250.0, 4000.0
-"""Density [veh/km] and flow [veh/h] that no lane exceeds."""
+FULL, LIGHT, EMPTY = 200.0, 10.0, 0.1
+"""Densities of a lane [veh/km]: bumper to bumper, so light that vehicles drive freely, and so
+light that a speed says nothing."""
+BUSIEST = 4000.0
+"""Flow of a lane [veh/h] that none exceeds."""
+FASTEST, SLOWEST = 200.0, 5.0
+"""Speeds [km/h] that few exceed, and that some do."""
+FEW = 0.01
+"""Share of the cells that may be beyond these limits, by noise; more tell of another unit."""
+SLOW = 0.4
+"""Share of the limit that vehicles exceed where they drive freely."""
+LARGEST_NUMBER = 1e6
+"""Largest number in a file, in its unit."""
+LONGEST_FIELD = 31 * 86_400
+"""Longest time that a field covers [s]."""
 
 
 @dataclass(frozen=True)
@@ -73,32 +90,71 @@ class FieldSource:
     reversed: bool = False
     delimiter: str | None = None
 
-    def read(self) -> tuple[FloatArray, FloatArray]:
+    def read(self, lanes: int, speed_limit: float) -> tuple[FloatArray, FloatArray]:
         """Return density [veh/km] and flow [veh/h], of shape (cells, intervals), from upstream on.
+
+        Args:
+            lanes: Lanes of the road.
+            speed_limit: Its speed limit [km/h].
 
         Raises:
             ValueError: A file is no table of numbers, the files do not fit one another, or a unit
-                is unknown or not that of the data; the message has the file.
+                is unknown or not that of the data; the message has the file, and the units that
+                the data may have.
             OSError: A file cannot be read.
+
+        Warns:
+            UserWarning: All speeds are low, which congestion may explain, or another unit.
         """
-        positive("cell", self.cell)
-        positive("interval", self.interval)
+        number(float, self.cell, "cell", Interval(0.001, 10))
+        number(float, self.interval, "interval", Interval(0.01, 3600))
+        integer("lanes", lanes, 1)
+        positive("speed_limit", speed_limit)
         require((self.speed is None) != (self.flow is None), "speed", "given, or else flow", None)
         density = self._table("density")
         kind = "speed" if self.flow is None else "flow"
-        path, other = str(getattr(self, kind)), self._table(kind)
+        path, other = getattr(self, kind), self._table(kind)
         allowed = f"a table of {self.density}'s shape {density.shape}"
-        require(other.shape == density.shape, path, allowed, other.shape)
-        flow = other if kind == "flow" else density * other
-        speed = flow / np.maximum(density, LEAST_DENSITY)
-        for file, table, (low, high), what, unit in (
-            (str(self.density), density, DENSEST, "densities", "veh/km"),
-            (path, speed, FASTEST, "speeds", "km/h"),
-        ):
-            largest = float(table.max())
-            allowed = f"{what} whose largest is {low:g} to {high:g} {unit}: check the units"
-            require(low <= largest <= high, file, allowed, f"{largest:.4g} {unit}")
+        require(other.shape == density.shape, str(path), allowed, other.shape)
+        lasts = density.shape[1] * self.interval
+        allowed = f"a field of at most {LONGEST_FIELD} s, at {self.interval:g} s a column"
+        require(lasts <= LONGEST_FIELD, str(self.density), allowed, f"{lasts:g} s")
+        self._check_unit("density", lambda factor: _odd_density(factor * density, lanes))
+        occupied = density > EMPTY * lanes
+        speed = (other if kind == "speed" else other / np.maximum(density, LEAST_DENSITY))[occupied]
+        light = speed[density[occupied] < LIGHT * lanes]
+        self._check_unit(kind, lambda f: _odd_speed(f * speed, f * light, speed_limit))
+        flow = density * other if kind == "speed" else other
+        most = BUSIEST * lanes
+        if (flow > most).mean() > FEW:
+            raise ValueError(
+                f"{path}: flow must be at most {most:g} veh/h on {lanes} lanes: check the units "
+                f"and lanes, got {flow.max():.4g} veh/h"
+            )
+        if speed.size and speed.max() < SLOW * speed_limit:
+            warnings.warn(
+                f"no speed of the field is above {speed.max():.0f} km/h, at a limit of "
+                f"{speed_limit:g} km/h: is speed_unit or flow_unit right?",
+                stacklevel=3,
+            )
         return density, flow
+
+    def _check_unit(self, kind: str, odd: Callable[[float], str | None]) -> None:
+        """Refuse data that are odd in the given unit, and name those in which they would not be.
+
+        Args:
+            kind: Of the data.
+            odd: What is odd about the data times a factor, or None.
+        """
+        problem, given = odd(1.0), getattr(self, f"{kind}_unit")
+        if problem is None:
+            return
+        known = UNITS[kind]
+        likely = [name for name in known if odd(known[name] / known[given]) is None]
+        raise ValueError(
+            f"{getattr(self, kind)}: {kind}_unit must be that of the data, likely "
+            f"{' or '.join(likely) or 'none that is known'}, got {given!r}: {problem}"
+        )
 
     def _table(self, kind: str) -> FloatArray:
         path, unit = getattr(self, kind), getattr(self, f"{kind}_unit")
@@ -109,15 +165,37 @@ class FieldSource:
             with path.open(encoding="utf-8-sig") as file:
                 table = np.loadtxt(file, ndmin=2, delimiter=self.delimiter)
         except ValueError as problem:
-            raise ValueError(f"{path} must be a table of numbers: {problem}") from problem
+            raise ValueError(f"{path} must be a table of numbers: {cut(problem)}") from problem
         require(table.size > 0, str(path), "a table of at least one number", table.shape)
-        for row, column in np.argwhere(~(np.isfinite(table) & (table >= 0.0)))[:1]:
+        for row, column in np.argwhere(~((table >= 0.0) & (table <= LARGEST_NUMBER)))[:1]:
             raise ValueError(
-                f"{path}: row {row + 1}, column {column + 1} must be finite and >= 0, got "
-                f"{table[row, column]}"
+                f"{path}: row {row + 1}, column {column + 1} must be in [0, {LARGEST_NUMBER:g}], "
+                f"got {table[row, column]}"
             )
         table = UNITS[kind][unit] * (table.T if self.transposed else table)
         return table[::-1] if self.reversed else table
+
+
+def _odd_density(density: FloatArray, lanes: int) -> str | None:
+    """Return what says that densities [veh/km] are of another unit."""
+    above = float((density > FULL * lanes).mean())
+    if above > FEW:
+        return f"{100 * above:.0f} % of cells are above {FULL * lanes:g} veh/km, full of vehicles"
+    largest = float(density.max())
+    return None if largest >= 1.0 else f"no density is above {largest:.2g} veh/km"
+
+
+def _odd_speed(speed: FloatArray, light: FloatArray, speed_limit: float) -> str | None:
+    """Return what says that speeds [km/h], or those in light traffic, are of another unit."""
+    above = float((speed > FASTEST).mean()) if speed.size else 0.0
+    if above > FEW:
+        return f"{100 * above:.0f} % of speeds are above {FASTEST:g} km/h"
+    if speed.size and speed.max() < SLOWEST:
+        return f"no speed is above {speed.max():.2g} km/h"
+    usual = float(np.median(light)) if light.size > FEW * speed.size else speed_limit
+    if usual >= SLOW * speed_limit:
+        return None
+    return f"speeds are {usual:.2g} km/h in light traffic, at a limit of {speed_limit:g} km/h"
 
 
 @dataclass(frozen=True)
@@ -136,27 +214,6 @@ class FieldRoad:
     segments: int
     lanes: int
     speed_limit: float
-
-    def check(self, density: FloatArray, flow: FloatArray) -> None:
-        """Raise ``ValueError`` for a field that the lanes cannot hold; warn where it is slow.
-
-        Args:
-            density: Densities [veh/km], all lanes together.
-            flow: Flows [veh/h].
-        """
-        for name, table, most, unit in (
-            ("density", density, DENSEST_LANE, "veh/km"), ("flow", flow, BUSIEST_LANE, "veh/h"),
-        ):  # fmt: skip
-            allowed = f"at most {most * self.lanes:g} {unit} on {self.lanes} lanes: check the units"
-            largest = float(table.max())
-            require(largest <= most * self.lanes, name, allowed, f"{largest:.4g} {unit}")
-        fastest = float((flow / np.maximum(density, LEAST_DENSITY)).max())
-        if fastest < 0.4 * self.speed_limit:
-            warnings.warn(
-                f"no speed of the field is above {fastest:.0f} km/h, at a limit of "
-                f"{self.speed_limit:g} km/h: is speed_unit or flow_unit right?",
-                stacklevel=3,
-            )
 
     def corridor(self, segment_length: float, duration: int) -> Corridor:
         """Return the road without demand and recordings."""
@@ -194,8 +251,7 @@ def import_field(
     """
     integer("duration", duration, 1)
     integer("segments", road.segments, 2)
-    density, flow = source.read()
-    road.check(density, flow)
+    density, flow = source.read(road.lanes, road.speed_limit)
     each = len(density) // (road.segments + 2)
     require(each >= 1, "segments", f"at most {len(density) - 2}", road.segments)
     field = np.stack(by_second(density, flow, road.segments + 2, source.interval), axis=-1)

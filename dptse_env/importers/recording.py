@@ -6,6 +6,7 @@ time. What grows in memory is a row for each vehicle and for each second.
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,17 +17,19 @@ import polars as pl
 from dptse_env.importers import tables
 from dptse_env.importers.placing import OFF, Road, part_in_words, placed
 from dptse_env.importers.resampling import TIME_UNIT, check_pieces, count_ends, whole_seconds
-from dptse_env.importers.source import Source, TrajectoryError, shown
+from dptse_env.importers.source import Source, TrajectoryError
 from dptse_env.traffic.record import Record
-from dptse_env.utils.fields import inside, integer, non_negative
+from dptse_env.utils.fields import cut, inside, integer, non_negative, shown
 
 BUCKET_ROWS = 400_000
 """Rows of a bucket; buckets are in memory one at a time."""
 MOST_BUCKETS = 512
 MOST_WAITING = 1_000_000
 """Points of all buckets together that wait in memory to be written."""
-LONGEST_SILENCE = 3600.0
+LONGEST_SILENCE = 600.0
 """Time without any row [s] after which a file is another recording, with windows of its own."""
+MOST_WINDOWS = 100_000
+"""Windows of a file at most; wrong times would otherwise ask for millions."""
 LARGEST_NUMBER = 10_000
 """Ids of vehicles below it are kept as they are; others are numbered in each window."""
 PICTURE_POINTS = 20_000
@@ -163,7 +166,7 @@ class Recording:
                 raise problem.__cause__ from None
             parquet = self.path.suffix.lower() in tables.PARQUET
             what = "it is no complete Parquet file: " if parquet else ""
-            reason = shown(str(problem).partition("\n")[0])
+            reason = cut(str(problem).partition("\n")[0])
             raise TrajectoryError(f"{self.path}: {what}{reason}") from problem
         if not (self.folder / "points").is_dir():
             raise TrajectoryError(f"{self.path}: it must have rows of vehicles, got none")
@@ -196,7 +199,7 @@ class Recording:
             raise TrajectoryError(f"{self.path}: it must have rows of vehicles{chosen}, got none")
         if seconds.filter(wanted).is_empty():
             raise TrajectoryError(
-                f"{self.path}: source.groups must be in the file, got {self.source.groups}"
+                f"{self.path}: source.groups must be in the file, got {shown(self.source.groups)}"
             )
         self.counts["rows"] = int(seconds["rows"].sum())
         self.counts["no_vehicle"] = int(seconds["no_vehicle"].sum())
@@ -207,7 +210,7 @@ class Recording:
         names = self._points.filter(lost, c("off").is_not_null()).select("off").unique()
         names = names.bottom_k(20, by="off")
         found = names.collect(engine="streaming")["off"].sort()
-        self.off_names = [shown(name) for name in found]
+        self.off_names = [cut(name) for name in found]
         self._require_on_road()
         return seconds
 
@@ -278,8 +281,13 @@ class Recording:
             )
             .with_columns(n=(c("last") - c("first") + 1 + self.options.pause) // stride)
         )
-        kept = parts.filter(c("n") > 0)
-        self.counts["far_away"] = int(parts.filter(c("n") <= 0)["rows"].sum())
+        kept, away = parts.filter(c("n") > 0), parts.filter(c("n") <= 0)
+        self.counts["far_away"] = int(away["rows"].sum())
+        if kept["n"].sum() > MOST_WINDOWS:
+            raise TrajectoryError(
+                f"{self.path}: its times must make at most {MOST_WINDOWS} windows of {stride} s, "
+                f"got {kept['n'].sum():.0f}: is the unit right (time in {self._units['time']})?"
+            )
         if kept.is_empty():
             longest = (parts["last"] - parts["first"]).to_numpy().max() + 1
             silences = f" between silences of over {LONGEST_SILENCE:g} s" if len(parts) > 1 else ""
@@ -287,6 +295,14 @@ class Recording:
                 f"{self.path}: it must last {self.road.corridor.duration + 1} s or more, the "
                 f"corridor's duration and a second, got {longest:.0f} s{silences} (time in "
                 f"{self._units['time']})"
+            )
+        if self.counts["far_away"]:
+            first = away.row(away["row"].arg_min(), named=True)
+            warnings.warn(
+                f"{self.path}, row {first['row']}: the time {first['begin'] + self.base:.6g} s is "
+                f"over {LONGEST_SILENCE:g} s from all windows: {self.counts['far_away']} such rows "
+                "are left out",
+                stacklevel=2,
             )
         self.windows = (
             kept.with_columns(place=pl.int_ranges(0, c("n").cast(pl.Int64)))

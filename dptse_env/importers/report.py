@@ -21,7 +21,7 @@ _COUNTS = {
         "other_group": "dropped: of another group than chosen",
         "off_lanes": "dropped: on other lanes, lateral positions or edges than the road's",
         "off_ends": "dropped: before the road's start or beyond its end",
-        "far_away": "dropped: an hour or more from all windows; are these times right?",
+        "far_away": "dropped: ten minutes or more from all windows; are these times right?",
         "duplicates": "dropped: duplicates of another row",
         "out_of_order": "out of order in time, sorted",
         "seconds": "vehicles at whole seconds, from the others",

@@ -12,7 +12,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from dptse_env.utils.fields import Interval, checked_fields, from_mapping, require, require_name
+from dptse_env.utils.fields import (
+    Interval,
+    checked_fields,
+    cut,
+    from_mapping,
+    require,
+    require_name,
+)
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "frame": 0.0}
 """Units of times in seconds; frames need a `Source.frame_rate`."""
@@ -30,22 +37,9 @@ ROLES = NUMBERS + LABELS
 data in which ``x`` is a corner of its box. A ``group`` is a road of its own in the file, such as a
 driving direction."""
 
-LONGEST_SHOWN, MOST_SHOWN = 60, 20
-"""Characters of a text of a file, and texts of a list, that a message shows."""
-
 
 class TrajectoryError(ValueError):
     """A file of trajectories cannot be imported; the message names file, row and field."""
-
-
-def shown(*texts: object) -> str:
-    """Return what a file says for a message, cut where it is long."""
-    cut = [
-        text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
-        for text in map(str, texts[:MOST_SHOWN])
-    ]
-    more = f" and {len(texts) - MOST_SHOWN} more" if len(texts) > MOST_SHOWN else ""
-    return ", ".join(cut) + more
 
 
 @dataclass(frozen=True)
@@ -159,7 +153,7 @@ def read_source(path: str | os.PathLike[str]) -> Source:
     except OSError as problem:
         raise ValueError(f"{path}: the mapping cannot be read: {problem.strerror}") from problem
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
-        raise ValueError(f"{path}: a mapping must be TOML: {problem}") from problem
+        raise ValueError(f"{path}: a mapping must be TOML: {cut(problem)}") from problem
     try:
         return from_mapping(Source, content, "source")
     except ValueError as problem:

@@ -23,7 +23,8 @@ import numpy as np
 import polars as pl
 from polars.io.plugins import register_io_source
 
-from dptse_env.importers.source import LABELS, NUMBERS, Source, TrajectoryError, shown
+from dptse_env.importers.source import LABELS, NUMBERS, Source, TrajectoryError
+from dptse_env.utils.fields import cut, shown
 
 SCHEMA = {
     "row": pl.Int64,
@@ -117,7 +118,9 @@ def scan(path: Path, form: Format, source: Source) -> Points:
             columns[role] = pl.when(text != "").then(text)  # an empty name is no name
             continue
         if not (kinds[name].is_numeric() or kinds[name] in (pl.String, pl.Null)):
-            raise TrajectoryError(f"{path}: {shown(name)} must be numbers, got {kinds[name]}")
+            raise TrajectoryError(
+                f"{path}: {cut(name)} must be numbers, got {cut(str(kinds[name]))}"
+            )
         quantity = lengths.get(role, role)
         factor = source.factor(quantity, form.units[quantity])
         columns[role] = _number(kinds[name], name, grouped) * factor
@@ -151,8 +154,8 @@ def field_text(path: Path, form: Format, source: Source, row: int, role: str) ->
     name = _roles(path, form, source, raw.collect_schema().names()).get(role, role)
     text = raw.filter(pl.col(ROW) == row).select(pl.col(name).cast(pl.String)).head(1)
     value = text.collect(engine="streaming")
-    got = repr(shown(value.item())) if len(value) and value.item() else "nothing"
-    return shown(name), got
+    got = shown(value.item()) if len(value) and value.item() else "nothing"
+    return cut(name), got
 
 
 def _raw(path: Path, form: Format, source: Source) -> _Raw:
@@ -174,7 +177,7 @@ def _raw(path: Path, form: Format, source: Source) -> _Raw:
             return _Raw(_from(lambda: _json(path, form, scalars)), size // BYTES)
         return _text(path, form)
     except (OSError, EOFError, zlib.error, csv.Error) as problem:
-        reason = getattr(problem, "strerror", None) or problem
+        reason = cut(getattr(problem, "strerror", None) or problem)
         raise TrajectoryError(f"{path}: the file cannot be read: {reason}") from problem
 
 
@@ -285,7 +288,7 @@ def _roles(path: Path, form: Format, source: Source, found: list[str]) -> dict[s
     missing += [f"one for {r}" for r in form.required if r not in (*roles, *form.columns)]
     if missing:
         raise TrajectoryError(
-            f"{path}: columns must be {', '.join(missing)} among others, found {shown(*found)}"
+            f"{path}: columns must be {', '.join(missing)} among others, found {shown(found)}"
         )
     return roles
 
@@ -294,7 +297,8 @@ def _find(path: Path, name: str, found: Iterable[str], option: str) -> str:
     by_name = {_normal(each): each for each in found}
     if _normal(name) not in by_name:
         raise TrajectoryError(
-            f"{path}: {option} must be a column of the file, got {name!r}; found {shown(*found)}"
+            f"{path}: {option} must be a column of the file, got {shown(name)}; found "
+            f"{shown([*found])}"
         )
     return by_name[_normal(name)]
 
@@ -374,7 +378,7 @@ def _xml(path: Path, form: Format) -> Iterator[pl.DataFrame]:
         ) from missing
     except (expat.ExpatError, EOFError, OSError, zlib.error) as broken:
         raise TrajectoryError(
-            f"{path}, row {parser.CurrentLineNumber}: it is no complete XML file: {broken}"
+            f"{path}, row {parser.CurrentLineNumber}: it is no complete XML file: {cut(broken)}"
         ) from broken
 
 
@@ -404,7 +408,7 @@ def _documents(path: Path) -> Iterator[Any]:
                 row += 1
         except (ValueError, RecursionError, EOFError, OSError, zlib.error) as broken:
             raise TrajectoryError(
-                f"{path}, row {row + 1}: it is no complete JSON array: {shown(broken)}"
+                f"{path}, row {row + 1}: it is no complete JSON array: {cut(broken)}"
             ) from broken
 
 
@@ -426,7 +430,7 @@ def _json(path: Path, form: Format, scalars: Iterable[str]) -> Iterator[pl.DataF
         missing = [name for name in (*form.lists, *scalars) if name not in document]
         if missing:
             raise TrajectoryError(
-                f"{where}: fields {', '.join(missing)} are missing, found {shown(*document)}"
+                f"{where}: fields {', '.join(missing)} are missing, found {shown([*document])}"
             )
         texts = (document[name] for name in scalars)
         names = [
@@ -436,7 +440,7 @@ def _json(path: Path, form: Format, scalars: Iterable[str]) -> Iterator[pl.DataF
             lists = [np.array(document[name], dtype=float) for name in form.lists]
         except (TypeError, ValueError, OverflowError) as problem:
             raise TrajectoryError(
-                f"{where}: {', '.join(form.lists)} must be lists of numbers: {shown(problem)}"
+                f"{where}: {', '.join(form.lists)} must be lists of numbers: {cut(problem)}"
             ) from problem
         shapes = {each.shape for each in lists}
         if len(shapes) > 1 or lists[0].ndim != 1:
@@ -463,7 +467,7 @@ def _by_direction(points: pl.LazyFrame, path: Path, source: Source) -> pl.LazyFr
     except (OSError, pl.exceptions.PolarsError) as problem:
         raise TrajectoryError(
             f"{path}: the driving directions must be in {meta} (columns id, drivingDirection), "
-            f"got {shown(repr(problem))}"
+            f"got {cut(repr(problem))}"
         ) from problem
     unknown = points.select("vehicle").unique().drop_nulls()
     for (name,) in (
@@ -473,7 +477,7 @@ def _by_direction(points: pl.LazyFrame, path: Path, source: Source) -> pl.LazyFr
         .rows()
     ):
         raise TrajectoryError(
-            f"{path}: vehicle {shown(name)} is not in {meta}, which has its direction"
+            f"{path}: vehicle {cut(name)} is not in {meta}, which has its direction"
         )
     extent = source.layout.extent
     if extent is None and "upper" in (source.groups or ["upper"]) and (table[:, 1] == "1").any():

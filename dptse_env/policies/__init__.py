@@ -8,6 +8,7 @@ from typing import Any
 
 from dptse_env.utils.arrays import AnyArray
 from dptse_env.utils.files import read_tensors
+from dptse_env.utils.registry import require_registered
 
 SUFFIX = ".safetensors"
 """Ending of the names of files with weights."""
@@ -81,19 +82,5 @@ def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
                 f"{name} is not a saved policy: its card must have a field {field!r} of type "
                 f"{kind.__name__}"
             )
-    require_registered(card, name)
+    require_registered(card["fits"]["action"], f"{name}: fits.action")
     return PolicyFile(name, card, weights)
-
-
-def require_registered(card: Mapping[str, Any], name: str) -> None:
-    """Refuse a card whose action is an import string: a file may not run code of a folder.
-
-    Raises:
-        ValueError: Its action is no name that a package registered.
-    """
-    action = card["fits"]["action"]
-    if ":" in action:
-        raise ValueError(
-            f"{name}: fits.action must be a registered name, got {action!r}: import strings come "
-            "from Python or the command line alone (dptse_env.register_part)"
-        )

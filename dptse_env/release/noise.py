@@ -69,14 +69,14 @@ def grid_of(sigma: float) -> float:
 def normal_of(bits: Bits) -> FloatArray:
     """Return the standard normal numbers of 64 random bits each, of the same shape.
 
-    The lowest bit is the sign; the others, an integer v, are the distribution function
-    (v + 1/2) 2^-64 of the number below zero.
+    The lowest bit is the sign, 1 below zero. The others are an integer v, and (v + 1/2) 2^-64 is
+    the probability of a number further out on that side.
     """
-    tail = (bits >> np.uint64(1)).astype(np.float64)
+    tail = (bits >> np.uint64(1)).view(np.int64).astype(np.float64)
     tail += 0.5
     tail *= 2.0**-64
-    normal: FloatArray = ndtri(tail)
-    np.negative(normal, out=normal, where=(bits & np.uint64(1)).astype(np.bool_))
+    sign = (bits << np.uint64(63)).view(np.float64)
+    normal: FloatArray = np.copysign(ndtri(tail), sign)
     return normal
 
 
@@ -101,7 +101,7 @@ def rounded_normal(scale: float, bits: int, more: Callable[[], int]) -> int:
             elif most < outer - error:
                 found += 1
             elif outer + error < least and most < inner - error:
-                return found if bits & 1 else -found
+                return -found if bits & 1 else found
             else:
                 tail, size = tail << 64 | more(), size + 64
 

@@ -99,7 +99,7 @@ class Paced(ReleaseModel):
     (`dptse_env.release.pacing`). With mu the parameter of the guarantee of a group of columns, a
     vehicle has a budget of mu^2 / 2 there against its replacement by another, and of mu^2 against
     being added or removed; the mu^2 of the groups add up to that of all releases. The guarantee
-    holds for any query policy, any estimator and any pacing: ``docs/privacy.md`` has the proof.
+    holds for any query policy, any estimator and any pacing: ``docs/proof.md`` has the proof.
 
     Attributes:
         mu: Parameter of Gaussian differential privacy of each group, shape (groups,).
@@ -238,7 +238,7 @@ class Paced(ReleaseModel):
 
     def _losses(self, paid: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mu and epsilon of vehicles that have paid at most (vehicles, groups)."""
-        squares = np.minimum(self._squares * paid, self._whole)
+        squares = np.minimum((1.0 + ROUNDING) * self._squares * paid, self._whole)
         return self._epsilons.bounds(np.sqrt(squares.sum(axis=1)))
 
     def report(self) -> PrivacyReport:

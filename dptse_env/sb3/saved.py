@@ -18,14 +18,14 @@ from torch import nn
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
-from dptse_env.policies import SUFFIX, TRANSFERABLE, read_policy, require_registered
+from dptse_env.policies import SUFFIX, TRANSFERABLE, read_policy
 from dptse_env.sb3.plackett_luce import PlackettLucePolicy, RoadChannels
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import Action, BoolArray, Observation
 from dptse_env.utils.fields import Interval, integer, number
 from dptse_env.utils.files import write_tensors
-from dptse_env.utils.registry import needed_for
+from dptse_env.utils.registry import needed_for, require_registered
 
 POLICY_FORMAT = "dptse-policy-1"
 """Format of the weights; its number is raised when saved weights change their meaning."""
@@ -123,7 +123,7 @@ def save_policy(
         raise ValueError(f"policy must be one of {', '.join(CLASSES)}, got {name}")
     if Path(path).suffix != SUFFIX:
         raise ValueError(f"path must end in {SUFFIX}, got {os.fspath(path)!r}")
-    card = {
+    card: dict[str, Any] = {
         "fits": _fit(config, name),
         "policy": {"class": name, "arguments": _arguments(policy)},
         "env": env,
@@ -137,7 +137,7 @@ def save_policy(
     }
     weights = {key: value.detach().cpu().numpy() for key, value in policy.state_dict().items()}
     try:
-        require_registered(card, "card")
+        require_registered(card["fits"]["action"], "fits.action")
         _made(card, weights, config)
     except ValueError as problem:
         raise ValueError(f"policy cannot be saved: {problem}") from problem

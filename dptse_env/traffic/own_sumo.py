@@ -94,29 +94,41 @@ class SumoScenario:
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
-        checked_fields(self, "network")
+        checked_fields(self, "corridor.network")
         n_files, n_sums = len(self.files), len(self.sha256)
-        require(n_sums == n_files, "network.sha256", f"one for each of {n_files} files", n_sums)
+        require(
+            n_sums == n_files, "corridor.network.sha256", f"one for each of {n_files} files", n_sums
+        )
         allowed = f"at most begin = {self.begin} s"
-        require(self.warm_up <= self.begin, "network.warm_up", allowed, self.warm_up)
+        require(self.warm_up <= self.begin, "corridor.network.warm_up", allowed, self.warm_up)
         steps = 1.0 / self.step_length
         allowed = "a whole part of a second"
-        require(abs(steps - round(steps)) < 1e-9, "network.step_length", allowed, self.step_length)
+        require(
+            abs(steps - round(steps)) < 1e-9,
+            "corridor.network.step_length",
+            allowed,
+            self.step_length,
+        )
         self._check_options()
         self._check_columns()
 
     def _check_options(self) -> None:
         for option in self.options:
             match = re.fullmatch(r"--([a-z][\w.-]*)(=.*)?", option)
-            require(match is not None, "network.options", "--name=value each", option)
+            require(match is not None, "corridor.network.options", "--name=value each", option)
             assert match is not None
             free = match[1] not in FORCED and not WRITES.search(match[1])
-            require(free, "network.options", "free of outputs and of what a recording sets", option)
+            require(
+                free,
+                "corridor.network.options",
+                "free of outputs and of what a recording sets",
+                option,
+            )
 
     def _check_columns(self) -> None:
         taken: dict[str, list[tuple[float, float]]] = {}
         for i, stretches in enumerate(self.columns):
-            path = f"network.columns[{i}]"
+            path = f"corridor.network.columns[{i}]"
             require(bool(stretches), path, "at least one stretch of an edge", stretches)
             for edge, start, end in stretches:
                 require(start < end, path, "stretches that end after they start", (start, end))
@@ -125,7 +137,12 @@ class SumoScenario:
             parts.sort()
             for (_, end), (start, _) in pairwise(parts):
                 apart = end <= start + TOLERANCE
-                require(apart, "network.columns", f"without overlap on edge {edge!r}", (start, end))
+                require(
+                    apart,
+                    "corridor.network.columns",
+                    f"without overlap on edge {edge!r}",
+                    (start, end),
+                )
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -24,9 +24,9 @@ import tomli_w
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, IncidentDistribution
-from dptse_env.utils.fields import from_mapping, shown
+from dptse_env.utils.fields import cut, from_mapping, shown
 from dptse_env.utils.files import write_atomically
-from dptse_env.utils.registry import Registry
+from dptse_env.utils.registry import Registry, require_registered
 
 SUFFIX = ".toml"
 """Ending of the name of a road file."""
@@ -210,7 +210,7 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
         raise ValueError(f"{path}: {problem}") from problem
     try:
         for key in PARTS:
-            _require_names(environment.get(key), f"{path}: {_ENVIRONMENT}.{key}")
+            require_registered(environment.get(key), f"{path}: {_ENVIRONMENT}.{key}")
         keywords = {key: _absolute(value, path.parent) for key, value in environment.items()}
     except RecursionError as problem:
         raise ValueError(f"{path}: {_ENVIRONMENT} must not be nested so deeply") from problem
@@ -258,7 +258,7 @@ def _content(path: Path) -> dict[str, Any]:
     except OSError as problem:
         raise ValueError(f"{path}: the road file cannot be read: {problem.strerror}") from problem
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
-        raise ValueError(f"{path}: a road file must be TOML: {problem}") from problem
+        raise ValueError(f"{path}: a road file must be TOML: {cut(problem)}") from problem
 
 
 def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:
@@ -285,18 +285,6 @@ def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[s
     fields |= {name: value for name, value in derived.items() if name not in content}
     assumed = () if "average_dwell" in content else ("average_dwell",)
     return from_mapping(Corridor, fields, "corridor"), assumed
-
-
-def _require_names(value: Any, path: str) -> None:
-    """Refuse a value of a keyword for parts that has ``"module:Name"`` in it."""
-    if isinstance(value, str) and ":" in value:
-        raise ValueError(
-            f"{path} must be a registered name, got {shown(value)}: import strings come from "
-            "Python or the command line alone"
-        )
-    if isinstance(value, Mapping | list):
-        for each in value.values() if isinstance(value, Mapping) else value:
-            _require_names(each, path)
 
 
 def _absolute(value: Any, folder: Path) -> Any:

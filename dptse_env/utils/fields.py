@@ -9,6 +9,7 @@ shows it. An error is one line: ``<path> must be <allowed>, got <value>``.
 import dataclasses
 import json
 import math
+import re
 import reprlib
 import types
 import typing
@@ -76,7 +77,7 @@ def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) ->
     hints = field_hints(cls)
     for key in values:
         if key not in hints:
-            raise ValueError(f"{prefix}{key} is unknown; allowed: {', '.join(hints)}")
+            raise ValueError(f"{prefix}{cut(key)} is unknown; allowed: {', '.join(hints)}")
     built = {
         name: convert(hints[name], value, f"{prefix}{name}", getattr(base, name, None))
         for name, value in values.items()
@@ -252,15 +253,32 @@ def _convert_union(options: tuple[Any, ...], value: Any, path: str, base: Any) -
     raise ValueError("; or ".join(problems))
 
 
-_SHORT = reprlib.Repr()
-_SHORT.maxlevel, _SHORT.maxlong, _SHORT.maxstring, _SHORT.maxother = 5, 200, 200, 200
+LONGEST_SHOWN = 200
+"""Characters of a value that a message shows."""
+
+
+class _Short(reprlib.Repr):
+    def repr_int(self, x: int, level: int) -> str:
+        """Describe an integer of more digits than Python puts in words, by their number."""
+        digits = int(x.bit_length() * math.log10(2))
+        return f"an integer of {digits} digits" if digits > LONGEST_SHOWN else repr(x)
+
+
+_SHORT = _Short()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 5, LONGEST_SHOWN, LONGEST_SHOWN
 _SHORT.maxdict = _SHORT.maxlist = _SHORT.maxtuple = 50
 
 
 def shown(value: Any) -> str:
-    """Return a value for a message, cut where it is long or nested deeply."""
-    text = _SHORT.repr(value)
-    return text if len(text) <= 200 else f"{text[:200]}..."
+    """Return a value for a message: in one line, cut where it is long or nested deeply."""
+    return cut(re.sub(r"\s*\n\s*", " ", _SHORT.repr(value)))
+
+
+def cut(value: Any) -> str:
+    """Return a key, a name or a reason for a message: without quotes, escaped and cut."""
+    text = str(value) if isinstance(value, str | Exception) else shown(value)
+    text = text if text.isprintable() else repr(text)[1:-1]
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
 _NON_NEGATIVE = Interval(0, math.inf, open_high=True)
@@ -333,7 +351,7 @@ def parse_json(text: str | bytes, path: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as problem:
-        raise ValueError(f"{path} must be JSON: {problem}") from problem
+        raise ValueError(f"{path} must be JSON: {cut(problem)}") from problem
 
 
 def read_json(path: str | Path) -> Any:

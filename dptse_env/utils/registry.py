@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from importlib.metadata import entry_points
 from typing import Any
 
-from dptse_env.utils.fields import shown
+from dptse_env.utils.fields import cut, require, shown
 
 PLUGINS = "dptse_env.plugins"
 """Group of entry points of other packages. Each names a function that registers their parts; it is
@@ -145,6 +145,23 @@ class Registry(Mapping[str, Any]):
         if type(part).__module__ == "builtins" and not hasattr(part, "__qualname__"):
             raise ValueError(f"{self.keyword} must {expected}, got {shown(part)}")
         raise ValueError(f"{self.keyword} {name_of_class(part)} must {expected}")
+
+
+def require_registered(value: Any, path: str) -> None:
+    """Refuse a value from a file that has ``"module:Name"`` in it; nothing is imported.
+
+    Raises:
+        ValueError: It does, perhaps in a nested value; the message starts with its path.
+    """
+    if isinstance(value, str):
+        allowed = "a registered name (import strings come from Python or the command line alone)"
+        require(":" not in value, path, allowed, value)
+    elif isinstance(value, Mapping):
+        for key, each in value.items():
+            require_registered(each, f"{path}.{cut(key)}")
+    elif isinstance(value, list):
+        for i, each in enumerate(value):
+            require_registered(each, f"{path}[{i}]")
 
 
 def name_of_class(part: Any) -> str:

@@ -23,7 +23,7 @@ def source(folder, rows=10, columns=20, **changes):
 
 
 def test_cells_become_segments_and_intervals_seconds(tmp_path):
-    field = read_field(source(tmp_path), 3)
+    field = read_field(source(tmp_path), 3, 4, 50.0)
     assert field.density.shape == field.speed.shape == (100, 5)
     assert field.segment_length == pytest.approx(0.1)
     # At 2.5 s, the middle of the first interval, the mean of the first two cells.
@@ -33,10 +33,10 @@ def test_cells_become_segments_and_intervals_seconds(tmp_path):
     # The mean speed of vehicles: flow over density.
     flow = (1.0 * 1.0 + 1.1 * 1.05) / (1.0 + 1.1)
     assert field.speed[0, 0] == pytest.approx(20.0 * 1.09728 * flow)
-    turned = read_field(source(tmp_path, reversed=True), 3)
+    turned = read_field(source(tmp_path, reversed=True), 3, 4, 50.0)
     np.testing.assert_allclose(turned.density, field.density[:, ::-1])
     with pytest.raises(ValueError, match="segments must be at most 8, got 9"):
-        read_field(source(tmp_path), 9)
+        read_field(source(tmp_path), 9, 4, 50.0)
 
 
 def test_more_noise_costs():

@@ -59,10 +59,10 @@ def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
 
 def test_tables_may_lie_the_other_way(tmp_path):
     source = write(tmp_path, transposed=True, reversed=True)
-    expected = write(tmp_path).read()
+    expected = write(tmp_path).read(4, 110.0)
     for name in ("density", "speed"):
         np.savetxt(tmp_path / f"{name}.txt", np.loadtxt(tmp_path / f"{name}.txt")[::-1].T)
-    np.testing.assert_array_equal(source.read(), expected)
+    np.testing.assert_array_equal(source.read(4, 110.0), expected)
 
 
 def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
@@ -91,12 +91,15 @@ def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
         ({"cell": 0.0}, {}, 100, r"cell must be"),
         ({}, {}, 450, r"duration must be below the field's 450 s, got 450"),
         ({}, {"segments": 9}, 100, r"segments must be at most 8, got 9"),
-        ({"density_unit": "veh/km"}, {}, 100, r"density\.txt must be .* got '0.0279 veh"),
-        ({"speed": None, "flow_unit": "veh/min"}, {}, 100, r"flow\.txt must be .* got '1.* km/h"),
-        ({}, {"lanes": 1}, 100, r"flow must be at most 4000 veh/h on 1 lanes.* got '\d+ veh/h"),
+        (
+            {},
+            {"lanes": 1},
+            100,
+            r"speed\.txt: flow must be at most 4000 veh/h on 1 lanes.* got \d+",
+        ),
         (b"fast slow\n", {}, 100, r"speed\.txt must be a table of numbers"),
         (b"1 2\n3 4\n", {}, 100, r"speed\.txt must be a table of .*density\.txt's shape"),
-        (b"1 2\n-3 4\n", {}, 100, r"speed\.txt: row 2, column 1 must be finite and >= 0, got -3"),
+        (b"1 2\n-3 4\n", {}, 100, r"speed\.txt: row 2, column 1 must be in \[0, 1e\+06\], got -3"),
         (None, {}, 100, r"speed\.txt must be a file, got a directory"),
     ],
 )
@@ -116,10 +119,51 @@ def test_fields_of_no_use_are_refused_and_leave_nothing(changes, road, duration,
     assert {each.name for each in tmp_path.iterdir()} == {"density.txt", "flow.txt", "speed.txt"}
 
 
-def test_slow_speeds_are_noticed_and_a_folder_is_never_replaced(tmp_path):
-    source = write(tmp_path)
-    np.savetxt(tmp_path / "speed.txt", 0.3048 * np.loadtxt(tmp_path / "speed.txt"))  # now in m/s
-    with pytest.warns(UserWarning, match=r"no speed of the field is above \d+ km/h, at a limit of"):
-        import_field(source, ROAD, tmp_path / "road", SPLITS, 100)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"density_unit": "veh/km"},
+            r"density\.txt: density_unit .* likely veh/ft or veh/m, got 'veh/km'",
+        ),
+        ({"speed": None, "flow_unit": "veh/min"}, r"flow\.txt: flow_unit .* likely veh/s, got"),
+        ({"speed": None, "flow_unit": "veh/h"}, r"flow\.txt: flow_unit .* likely veh/s, got"),
+        (
+            {"speed_unit": "m/s"},
+            r"speed\.txt: .* likely km/h or ft/s .* 100 % of speeds are above 2",
+        ),
+    ],
+)
+def test_forgotten_units_are_refused_with_the_likely_one(changes, message, tmp_path):
+    flow = {"flow": tmp_path / "flow.txt"} if "speed" in changes else {}
+    with pytest.raises(ValueError, match=message):
+        write(tmp_path, **changes, **flow).read(4, 110.0)
+
+
+def test_speeds_in_metres_a_second_are_told_in_light_traffic_alone(tmp_path):
+    source = write(tmp_path, speed_unit="km/h")
+    np.savetxt(tmp_path / "speed.txt", np.full((10, 90), 29.0))
+    allowed = r"likely m/s or mi/h, got 'km/h': speeds are 29 km/h in light traffic, at a limit"
+    with pytest.raises(ValueError, match=rf"speed\.txt: speed_unit must be .*{allowed} of 110"):
+        source.read(4, 110.0)
+    np.savetxt(tmp_path / "density.txt", np.full((10, 90), 0.02))  # 16 veh/km a lane
+    with pytest.warns(UserWarning, match=r"no speed of the field is above 29 km/h, at a limit of"):
+        source.read(4, 110.0)
+
+
+def test_a_few_cells_may_be_odd(tmp_path):
+    source, speed = write(tmp_path), np.full((10, 90), 60.0)
+    expected = source.read(4, 110.0)[0]
+    speed.flat[:9] = 300.0  # 329 km/h in 1 % of the cells
+    np.savetxt(tmp_path / "speed.txt", speed)
+    np.testing.assert_array_equal(source.read(4, 110.0)[0], expected)
+    speed.flat[:10] = 300.0
+    np.savetxt(tmp_path / "speed.txt", speed)
+    with pytest.raises(ValueError, match=r"likely none that is known, got 'ft/s': 1 % of speeds"):
+        source.read(4, 110.0)
+
+
+def test_a_folder_is_never_replaced(tmp_path):
+    import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
     with pytest.raises(ValueError, match=r"output must be a folder that does not exist yet"):
         import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)

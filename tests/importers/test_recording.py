@@ -1,6 +1,7 @@
 """Points become windows of whole seconds: gaps, ids that are used again, wrong rows."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 
@@ -39,17 +40,21 @@ def test_windows_follow_one_another_and_are_split_by_time(tmp_path):
     assert starts(run(path, pause=9, skip_start=5.0, skip_end=20.0)) == [5.0, 35.0, 65.0]
 
 
-@pytest.mark.parametrize("stray", [-4000.0, 1e9, 1e300])
+@pytest.mark.parametrize("stray", [-1.0, 1e9, 1e300])
 def test_a_wrong_time_is_counted_and_left_out(stray, tmp_path):
-    points = stream()
+    points = stream() + np.array([0, 1000, 0, 0])
     expected = run(plain(subfolder(tmp_path, "clean"), points))
     wrong = points[[500]] * [1, 0, 1, 1] + np.array([0, stray, 0, 0])
-    # In the place of the first row, as well as amid the file.
-    for name, rows in (
-        ("first", [*wrong, *points]),
-        ("amid", [*points[:900], *wrong, *points[900:]]),
+    # In the place of the first row, as well as amid the file; a header is row 1.
+    for row, rows in (
+        (2, [*wrong, *points]),
+        (902, [*points[:900], *wrong, *points[900:]]),
     ):
-        imported = run(plain(subfolder(tmp_path, name), np.array(rows)))
+        path = plain(subfolder(tmp_path, str(row)), np.array(rows))
+        time = re.escape(f"{stray:.6g}")
+        message = rf"a\.csv, row {row}: the time {time} s is over 600 s from all windows: 1 such"
+        with pytest.warns(UserWarning, match=message):
+            imported = run(path)
         assert starts(imported) == starts(expected)
         file = first_file(imported)
         assert file["far_away"] == 1
@@ -60,7 +65,17 @@ def test_a_wrong_time_is_counted_and_left_out(stray, tmp_path):
             np.testing.assert_array_equal(one.speed_sums, other.speed_sums)
 
 
-def test_a_silence_of_over_an_hour_begins_another_recording(tmp_path):
+def test_times_without_end_are_refused_before_windows_are_laid(tmp_path):
+    points = stream(seconds=45.0)
+    strays = np.repeat(points[:1], 20_000, axis=0)
+    strays[:, 1] = 500.0 * np.arange(1, 20_001)
+    path = plain(tmp_path / "a.csv", np.concatenate([points, strays]))
+    message = r"a\.csv: its times must make at most 100000 windows of 21 s, got 476\d+: is the unit"
+    with pytest.raises(TrajectoryError, match=message):
+        run(path, splits=ALL)
+
+
+def test_a_silence_of_over_ten_minutes_begins_another_recording(tmp_path):
     points = stream(seconds=45.0)
     later = points + np.array([100, 86_400, 0, 0])
     imported = run(plain(tmp_path / "a.csv", np.concatenate([points, later])), splits=ALL)

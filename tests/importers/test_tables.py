@@ -208,7 +208,7 @@ BAD = {
         ("t,id,s,v\n", "must have rows of vehicles, got none"),
         ("t,id,s,v\n0,1,2,3\n1,1,here,3\n", "row 3: s must be a finite number, got 'here'"),
         ("t,id,s,v\n0,1,2,3\n\n1,1,,3\n", "row 4: s must be a finite number, got nothing"),
-        ("t,id,x,v\n0,1,2,3\n", r"source\.columns\.x must be .*'s'; found t, id, x, v"),
+        ("t,id,x,v\n0,1,2,3\n", r"source\.columns\.x must be .*'s'; found \['t', 'id', 'x', 'v'\]"),
         (b"t,id,s,v\n0,\xff,2,3\n", "utf-8"),
         ("t,\rid,s,v\n0,1,2,3\n", "the file cannot be read: new-line character"),
         (f"t,id,s,v\n0,1,{LONG},3\n", "row 2: s must be"),

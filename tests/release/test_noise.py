@@ -86,7 +86,7 @@ def test_normal_numbers_are_within_a_thousandth_of_the_doubt_that_is_allowed(siz
         v = int(mpmath.erfc(size / mpmath.sqrt(2)) * 2**63)
         for tail in (v, v + 1, v + 12345):
             exact = -mpmath.sqrt(2) * mpmath.erfinv(1 - mpmath.mpf(2 * tail + 1) / 2**64)
-            below, above = normal_of(np.array([2 * tail, 2 * tail + 1], dtype=np.uint64)).tolist()
+            above, below = normal_of(np.array([2 * tail, 2 * tail + 1], dtype=np.uint64)).tolist()
             assert below == -above
             assert abs(float(below - exact)) < DOUBT * (1.0 + size) / 1000.0
 
@@ -106,7 +106,7 @@ def test_bits_at_the_border_between_two_integers_are_settled_by_more_of_them(sca
         tail, rest = int(mpmath.floor(at)), int(mpmath.floor((at - mpmath.floor(at)) * 2**64))
     for first, expected in ((rest + 2, border), (max(rest - 2, 0), border + 1)):
         further = iter([first, 0])
-        found = rounded_normal(scale, 2 * tail, lambda further=further: next(further))
+        found = rounded_normal(scale, 2 * tail + 1, lambda further=further: next(further))
         low, high = interval(scale, found)
         with mpmath.workdps(60):
             value = (mpmath.mpf(tail) + mpmath.mpf(first) / 2**64) / 2**64
@@ -131,6 +131,21 @@ def test_where_all_noise_is_in_doubt_releases_are_the_same(monkeypatch):
     certain = drawn(started(1), 3, ONE)
     monkeypatch.setattr(module, "DOUBT", 1.0)
     np.testing.assert_array_equal(drawn(started(1), 3, ONE), certain)
+
+
+def test_just_what_an_error_could_take_to_another_integer_and_what_is_far_is_settled(monkeypatch):
+    """Numbers are three times as large as normal ones, and a settled one shows as 7."""
+    monkeypatch.setattr(module, "rounded_normal", lambda scale, bits, more: 7)
+    monkeypatch.setattr(module, "normal_of", lambda bits: 3.0 * normal_of(bits))
+    monkeypatch.setattr(module, "DOUBT", 2.0**-15)
+    found = drawn(started(0), BLOCK) / np.array([2.0**-6, 2.0**-7])
+    bits = streams(0)[0].integers(2**64, size=(BLOCK, 1, S, 2), dtype=np.uint64)
+    z, scale = 3.0 * normal_of(bits), SIGMA / np.array([2.0**-6, 2.0**-7])
+    error = 2.0**-15 * (1.0 + abs(z))
+    low, high, far = np.rint(scale * (z - error)), np.rint(scale * (z + error)), abs(z) > FAR
+    np.testing.assert_array_equal(found, np.where((low != high) | far, 7.0, low))
+    assert (far & (low == high)).any()
+    assert 0.1 < (low != high).mean() < 0.9
 
 
 @pytest.mark.parametrize("source", ["seeded", "secure"])

@@ -22,6 +22,7 @@ from dptse_env.release.noise import Noise
 from tests.helpers import AWAY, record
 
 from .worlds import (
+    BOTH,
     COLUMNS,
     LENGTH,
     LIMIT,
@@ -110,17 +111,18 @@ def test_noise_is_that_of_the_prices_on_a_grid_that_is_as_public():
 
 
 def test_a_second_episode_is_released_like_the_first():
-    """No ledger, price or account outlasts a reset."""
-    release = started(Worlds(crowd()), epsilon=0.5)
+    """No ledger, price or account of either of two episodes outlasts a reset."""
+    release = started(Worlds(crowd(), crowd(seed=1)), epsilon=0.5)
     told = []
     for _ in range(2):
-        release.reset(ONE, streams(3))
+        release.reset(BOTH, streams(3, 4))
         assert not release.prices.any()
-        assert not np.concatenate([*release.spent(ONE, ONE), release.budgets_spent(ONE)]).any()
-        assert not release.private(ONE, ONE)["n_refused"].any()
-        rounds = [release.release(request(second)) for second in np.tile(ROUNDS, 3).tolist()]
+        assert not np.concatenate([*release.spent(BOTH, BOTH), release.budgets_spent(BOTH)]).any()
+        assert not release.private(BOTH, BOTH)["n_refused"].any()
+        asked = [request(second, episodes=BOTH) for second in np.tile(ROUNDS, 3).tolist()]
+        rounds = [release.release(each) for each in asked]
         values = [np.concatenate([each.values, each.sigma]) for each in rounds]
-        told.append((values, release.ledgers.paid.copy(), release.private(ONE, ONE)["n_refused"]))
+        told.append((values, release.ledgers.paid.copy(), release.private(BOTH, BOTH)["n_refused"]))
     for first, second in zip(*told, strict=True):
         np.testing.assert_array_equal(first, second)
         assert np.any(first)
@@ -223,6 +225,14 @@ def test_a_part_of_the_budget_is_kept_back_for_rounding(adjacency):
     assert counts == [1.0, 1.0, 1.0, 0.0]
     (offered,) = release.pacing.budget
     assert offered < release.ledgers.budget[0] < release.budget[0]
+
+
+def test_more_payments_than_the_reserve_covers_are_refused(monkeypatch):
+    """A vehicle may pay every query of its segment in every second."""
+    monkeypatch.setattr("dptse_env.privacy.gaussian.MOST_PAYMENTS", 3 * T)
+    WANDERER.release(PacedSettings(), spans=(1, 2), bandwidth=6)
+    with pytest.raises(ValueError, match=r"^horizon must be shorter: .* 24 times .*48 payments"):
+        WANDERER.release(PacedSettings(), spans=(1, 2, 3), bandwidth=6)
 
 
 # --- the account, and the report ---------------------------------------------------------------

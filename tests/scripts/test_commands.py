@@ -18,6 +18,7 @@ pytest.importorskip("tyro")
 
 import dptse_env
 from dptse_env import command_line
+from dptse_env.privacy import DELTAS
 from dptse_env.traffic import RecordingError
 from dptse_env.utils.registry import EXTRAS
 from scripts import info
@@ -111,6 +112,17 @@ def test_a_pipe_may_lack_letters(monkeypatch):
     print("ε")
     pipe.flush()
     assert pipe.buffer.getvalue().endswith(b"?\n")
+
+
+def test_information_on_trips_is_a_row_for_each_number_of_them():
+    header, *rows = [
+        row.split() for row in run_command("info", "--mu", "2.118").stdout.splitlines()
+    ]
+    assert rows[2] == ["10", "6.698", "37.2", "42.3", "46.5", "50.2", "53.5"]
+    assert header[-len(rows[2]) + 2 :] == list(DELTAS)
+    found = json.loads(run_command("info", "--mu", "2.118", "--json").stdout)
+    assert list(found) == [row[0] for row in rows] == ["1", "2", "10", "50", "250"]
+    assert run_command("info", "--mu", "0").returncode == 2
 
 
 def test_information_has_what_a_bug_report_needs():

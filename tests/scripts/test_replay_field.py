@@ -12,7 +12,7 @@ def test_a_row_for_each_estimator(tmp_path):
         "replay-field", "--density", field.density, "--speed", field.speed,
         "--cell", "0.05", "--interval", "5",
         "--density-unit", "veh/ft", "--speed-unit", "ft/s", "--segments", "3", "--window", "100",
-        "--repeats", "1",
+        "--repeats", "1", "--speed-limit", "50",
     ]  # fmt: skip
     done = run_command(*words, "--estimators", "ekf", "recurrent")
     assert done.returncode == 0, done.stderr

@@ -1,5 +1,8 @@
 """Roads by name and as TOML files."""
 
+import sys
+
+import gymnasium as gym
 import pytest
 
 from dptse_env.config import resolve
@@ -98,22 +101,49 @@ def test_bad_files_are_refused_by_file_and_field(road, old, new, message):
 
 
 @pytest.mark.parametrize(
-    ("keyword", "value"),
+    ("keyword", "value", "path"),
     [
-        ("action", '"own:Part"'),
-        ("estimator", '"own:Part.json"'),
-        ("observation", '["default", "own:Part"]'),
-        ("privacy", '{ preset = "own:Part" }'),
-        ("reward", '"own:Part"'),
+        ("action", '"own:Part"', ""),
+        ("estimator", '"own:Part"', ""),
+        ("observation", '["default", "own:Part"]', r"\[1\]"),
+        ("privacy", '{ preset = "own:Part" }', r"\.preset"),
+        ("privacy", '{ preset = "paced", pacing = "own:Part" }', r"\.pacing"),
+        ("reward", '"own:Part"', ""),
     ],
 )
-def test_a_file_imports_no_code(road, keyword, value, monkeypatch):
+def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
     assert {*REGISTRIES} - {"corridor", "pacing", "schedule"} == {*PARTS}  # each of them is here
-    (road.parent / "own.py").write_text("raise SystemExit('code of the current folder has run')")
-    monkeypatch.syspath_prepend(road.parent)
+    trace = road.parent / "trace"
+    (road.parent / "own.py").write_text(f"import os\nos.mkdir({str(trace)!r})\nPart = None")
+    monkeypatch.chdir(road.parent)
+    monkeypatch.syspath_prepend("")
+    monkeypatch.delitem(sys.modules, "own", raising=False)
     road.write_text(ROAD.replace("bandwidth = 3", f"{keyword} = {value}"))
-    message = rf"My road\.toml: environment\.{keyword} must be a registered name, got 'own:Part"
+    allowed = r"a registered name \(import strings come from Python or the command line alone\)"
+    message = rf"My road\.toml: environment\.{keyword}{path} must be {allowed}, got 'own:Part'$"
     with pytest.raises(ValueError, match=message):
+        gym.make("dptse_env:dptse/PrivateHighway-v1", corridor=str(road))
+    assert not trace.exists()
+    with pytest.raises(ValueError, match=r"^estimator must be a class, .*, got None$"):
+        gym.make("dptse_env:dptse/PrivateHighway-v1", estimator="own:Part")  # as Python may
+    assert trace.exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("bandwidth = 0", r"environment\.bandwidth must be an integer in 1"),
+        ('estimator = "best"', r"environment\.estimator must be one of ekf, .*got 'best'"),
+        ("epsilon = 0", r"environment\.privacy\.epsilon must be"),
+        ('incident = "some"', r"environment\.incident must be one of"),
+        ('"a\\nb" = 0', r"environment\.a\\nb is unknown"),
+        ("bandwidth = 9", r"environment\.bandwidth must be in 1\.\.8, got 9"),
+    ],
+)
+def test_bad_keywords_of_a_file_are_refused_by_file_and_key(road, line, message):
+    text = ROAD.replace("bandwidth = 3", line).replace('"arz.json"', '"w99-3lane"')
+    road.write_text(text)
+    with pytest.raises(ValueError, match=rf"^.*My road\.toml: {message}"):
         resolve("private-highway", {"corridor": str(road)})
 
 

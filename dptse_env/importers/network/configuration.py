@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 from dptse_env.importers.network.net import UNREADABLE, open_xml, root_of
 from dptse_env.traffic.own_sumo import FORCED, READ_BY, WRITES
+from dptse_env.utils.fields import shown
 
 SHORT = {
     "n": "net-file", "net": "net-file",
@@ -62,7 +63,7 @@ class Files:
                 which no digest would cover.
         """
         if not self.routes and not self.additional:
-            raise ValueError("routes: must have at least one file, got none")
+            raise ValueError(f"routes: must have at least one file for {self.net}, got none")
         for path in self.routes:
             if _n_elements(path, "routes") <= 1:
                 raise ValueError(f"routes: {path} must have vehicles, got an empty file")
@@ -118,7 +119,7 @@ def _seconds(text: str, where: str) -> float:
         *clock, rest = (float(part) for part in text.split(":"))
         weights = {0: (), 2: (3600.0, 60.0), 3: (86400.0, 3600.0, 60.0)}[len(clock)]
     except (ValueError, KeyError) as error:
-        raise ValueError(f"{where} must be seconds or hh:mm:ss, got {text[:60]!r}") from error
+        raise ValueError(f"{where} must be seconds or hh:mm:ss, got {shown(text)}") from error
     return sum(weight * part for weight, part in zip(weights, clock, strict=True)) + rest
 
 
@@ -139,7 +140,7 @@ def _n_elements(path: Path, where: str) -> int:
         if element.tag in READ_BY and read is not None:
             raise ValueError(
                 f"{where}: {path}: <{element.tag}> must not read another file, got "
-                f"{read[:200]!r}: put its content in its place"
+                f"{shown(read)}: put its content in its place"
             )
         element.clear()  # route files may be large
     return count

@@ -82,7 +82,8 @@ def import_road(
     try:
         record = simulate_in_worker(draft, seed)
     except RecordingError as error:
-        raise ValueError(f"SUMO refuses these files: {' '.join(str(error).split())}") from error
+        reason = " ".join(str(error).split())
+        raise ValueError(f"net: {files.net}: SUMO refuses these files: {reason:.500}") from error
     if not (record.segment < draft.n_mainline).any():
         seen = f"{record.n_vehicles} on its ramps or ends" if record.n_rows else "none"
         routes = ", ".join(path.name for path in files.routes)

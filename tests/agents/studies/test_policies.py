@@ -92,17 +92,18 @@ def test_policies_that_cannot_be_found_are_refused():
 
 @pytest.mark.slow
 def test_a_small_study_plays_validation_then_test_traffic(tmp_path, monkeypatch):
-    keywords = {"estimator": "random_walk", "bandwidth": 2, "horizon": 80}
+    capped = {"privacy": "capped"}
+    keywords = {"estimator": "random_walk", "bandwidth": 2, "horizon": 80, **capped}
     calm = {**keywords, "incident": "none"}
     small = {
         "SETTINGS": {
             PRIMARY: policies.Setting("a short road", keywords, SHORT),
             "moved": policies.Setting("calm", calm, SHORT),
         },
-        "WORLDS": (policies.World("highway", "paced", "random_walk"),),
+        "WORLDS": (policies.World("highway", "capped", "random_walk"),),
         "RULES": ("paper", "round-robin"), "TOGETHER": (), "EPSILONS": (5.0,),
         "VALIDATION_TRAFFIC": (1000, 1001), "TEST_TRAFFIC": (2000, 2001),
-        "ENVS": {("highway", "paced"): SHORT}, "BANDWIDTHS": {"highway": (1, 2)},
+        "ENVS": {"highway": SHORT}, "BANDWIDTHS": {"highway": (1, 2)},
         "CHOICE_TRAFFIC": {"highway": (2000, 2001)},
         "TRAFFIC": {"own": {"horizon": 80}, "krauss-two-peaks": {"horizon": 90}},
     }  # fmt: skip
@@ -110,10 +111,10 @@ def test_a_small_study_plays_validation_then_test_traffic(tmp_path, monkeypatch)
         monkeypatch.setattr(policies, name, value)
     runs = tmp_path / "runs"
     for seed in range(2):
-        save_untrained(runs / f"pl-{seed}" / "best.safetensors", seed=seed)
+        save_untrained(runs / f"pl-{seed}" / "best.safetensors", seed=seed, **capped)
     with pytest.raises(ValueError, match="both plackett-luce of training seed 0"):
         policies.study([f"primary={runs}", f"primary={runs}/pl-0"])
-    study = policies.study([f"primary={runs}", f"paced={runs}"])
+    study = policies.study([f"primary={runs}", f"capped={runs}"])
     run(study, Place(tmp_path, THIS_PROCESS), progress=False)
     rows = read_rows("policies", tmp_path)
     test = rows.filter(part=TEST)

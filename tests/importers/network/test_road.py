@@ -47,7 +47,7 @@ ELSEWHERE = '<routes><vehicle id="v" depart="0"><route edges="elsewhere"/></vehi
             ELSEWHERE.replace("elsewhere", "nowhere"),
             "SUMO refuses these files: recording road with traffic seed 0 failed",
         ),
-        (None, "routes: must have at least one file, got none"),
+        (None, "routes: must have at least one file for "),
     ],
 )
 def test_routes_of_no_use_are_refused(files, tmp_path, content, message):

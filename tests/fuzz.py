@@ -1,0 +1,565 @@
+"""Random configurations and hostile files: each works, or is refused in one line with a path.
+
+    python -m tests.fuzz                     # 1,000 configurations and 400 files, ten minutes
+    python -m tests.fuzz --only roads:17     # one of them again
+
+A case is drawn from the seed, its kind and its number, and tried in a process of its own kind: it
+may take `LONGEST` seconds of the processor and `MEMORY` bytes beyond those of the imports. What
+raises anything but a `ValueError` of one line that begins with the keyword or has the file, takes
+longer, needs more, or kills the process, has escaped; the exit status says whether any has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import contextlib
+import dataclasses
+import gzip
+import io
+import json
+import math
+import multiprocessing
+import re
+import shutil
+import sys
+import tempfile
+import time
+import traceback
+import types
+import typing
+import warnings
+from collections import Counter
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import polars as pl
+
+import dptse_env
+from agents.policies import find_policy
+from dptse_env.config import EnvConfig
+from dptse_env.estimators import ESTIMATORS, settings_type
+from dptse_env.estimators.settings import available_settings, load_settings, write_settings
+from dptse_env.importers import Layout, Source, import_trajectories
+from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
+from dptse_env.importers.folder import Split
+from dptse_env.importers.network import find_layout, import_road, read_configuration
+from dptse_env.importers.source import read_source
+from dptse_env.model import ARZParameters, load_parameters
+from dptse_env.model.parameters import write_parameters
+from dptse_env.policies import read_policy, shipped_policies
+from dptse_env.registration import ENVIRONMENTS
+from dptse_env.release import PACINGS, RELEASE_MODELS
+from dptse_env.spaces.actions import ACTION_ENCODINGS
+from dptse_env.spaces.observations import BLOCKS
+from dptse_env.spaces.rewards import REWARDS
+from dptse_env.traffic import CORRIDORS, SHORT_HIGHWAY, write_corridor
+from dptse_env.utils.fields import Interval, field_hints
+from tests.hostile import ODD, changed, changed_tensors, little_memory
+from tests.importers.data import PLAIN, SPLITS, STRAIGHT, plain, stream
+from tests.importers.network.conftest import PATH, motorway
+from tests.importers.test_tables import text_of_ngsim
+
+LONGEST = 10.0
+"""Processor time of a case [s]."""
+MEMORY = 500 * 2**20
+"""Bytes of a case beyond those of the process before."""
+PATIENCE = 120.0
+"""Time after which a case counts as without end, whatever else the machine does [s]."""
+LONGEST_MESSAGE = 1500
+"""Characters of a message, its path aside."""
+
+SHIPPED = Path(dptse_env.__file__).parent
+KEYWORDS = (
+    *(name for name in field_hints(EnvConfig) if name != "inherited"),
+    "epsilon", "delta", "incident", "demand",
+)  # fmt: skip
+PATHS = (*KEYWORDS, r"no_such\nkeyword", "none.toml", "none.json")
+"""What a message on a configuration may begin with."""
+
+
+# --- configurations -------------------------------------------------------------------------------
+
+
+def some(hint, rng, wrong=0.02):
+    """A value of an annotated type as plain JSON, or here and there one that is `ODD`."""
+    if rng.random() < wrong:
+        return ODD[rng.integers(len(ODD))]
+    origin, items, interval = typing.get_origin(hint), typing.get_args(hint), None
+    if origin is typing.Annotated:
+        hint, *extras = items
+        interval = next((each for each in extras if isinstance(each, Interval)), None)
+        origin, items = typing.get_origin(hint), typing.get_args(hint)
+    if hint is int or hint is float:
+        return some_number(hint, interval or Interval(-1000, 1000), rng)
+    if hint is bool:
+        return bool(rng.integers(2))
+    if origin in (typing.Union, types.UnionType):
+        return some(items[rng.integers(len(items))], rng, wrong)
+    if origin is typing.Literal:
+        return items[rng.integers(len(items))]
+    if origin is tuple and items[1:] == (...,):
+        values = [some(items[0], rng, wrong) for _ in range(rng.integers(5))]
+        with contextlib.suppress(TypeError, IndexError):  # steps from time 0 on, rather
+            values = [[0.0, *values[0][1:]], *sorted(values[1:])] if rng.random() < 0.8 else values
+        return values
+    if origin is tuple:
+        return [some(each, rng, wrong) for each in items]
+    if dataclasses.is_dataclass(hint):
+        return some_fields(hint, rng, wrong)
+    return None if hint is type(None) else "name"
+
+
+def some_number(kind, interval, rng):
+    """A number of an interval: an end, next to one, amid it, or of any size in between."""
+    low, high = max(interval.low, -1e308), min(interval.high, 1e308)
+    amid = low + (min(high, 1e6) - low) * rng.random() ** 4
+    size = min(max(10.0 ** rng.uniform(-12, 12), low), high)
+    value = (low, high, math.nextafter(low, high), amid, amid, amid, size)[rng.integers(7)]
+    return math.floor(value) if kind is int else float(value)
+
+
+def some_fields(cls, rng, wrong, n=3):
+    """A mapping of those fields of a dataclass that must be given, and of some others."""
+    missing, hints = dataclasses.MISSING, field_hints(cls)
+    needed = [
+        field.name
+        for field in dataclasses.fields(cls)
+        if field.name in hints and field.default is missing and field.default_factory is missing
+    ]
+    if cls is type(SHORT_HIGHWAY):
+        needed = []  # the others are those of the road that is changed
+    chosen = {*needed, *rng.choice([*hints], min(len(hints), int(rng.integers(n + 1))), False)}
+    return {str(name): some(hints[name], rng, wrong) for name in hints if name in chosen}
+
+
+def one_of(names, rng):
+    names = [*names]
+    return names[rng.integers(len(names))]
+
+
+NAMES = {
+    "corridor": [*CORRIDORS, "none.toml"],
+    "estimator": [*ESTIMATORS],
+    "parameters": ["paper", "w99-3lane", "none.json"],
+    "estimator_settings": [*available_settings(), "none.json"],
+    "action": [*ACTION_ENCODINGS],
+    "reward": [*REWARDS],
+    "backend": ["compiled", "compiled", "reference"],
+    "query_spans": [[1], [1, 2], [1, 2, 4], [2]],
+    "price_levels": [[1.0], [0.5, 1, 2]],
+    "bandwidth_unit": ["segments", "sums"],
+    "bandwidth": [1, 2, 3, 1000],
+    "horizon": [1, 5, 240, 241],
+    "incident": ["preset", "none", "random"],
+    "demand": ["preset", "random"],
+    "traffic_seeds": ["0:2", "0:20000", "1:0", [0, 1], [1, 1], [], [5e-324]],
+}
+"""What keywords may be beside mappings of fields."""
+ONLY_NAMES = ("estimator", "action", "reward", "backend", "bandwidth_unit")
+
+
+def keyword(name, rng, given):
+    """A value of a keyword, given those that were drawn before."""
+    hints = {**field_hints(EnvConfig), **field_hints(type(SHORT_HIGHWAY))}
+    if rng.random() < 0.05:
+        return ODD[rng.integers(len(ODD))]
+    if name in NAMES and (rng.random() < 0.5 or name in ONLY_NAMES):
+        return one_of(NAMES[name], rng)
+    match name:
+        case "epsilon" | "delta":
+            return float(10.0 ** rng.uniform(-5, 3 if name == "epsilon" else 0))
+        case "parameters":
+            return some_fields(ARZParameters, rng, 0.02)
+        case "estimator_settings":
+            estimator = given.get("estimator")
+            known = estimator if estimator in NAMES["estimator"] else "ekf"
+            return some_fields(settings_type(known), rng, 0.02)
+        case "observation":
+            return [one_of(["default", *BLOCKS], rng) for _ in range(rng.integers(1, 4))]
+        case "privacy":
+            preset = one_of(RELEASE_MODELS, rng)
+            fields = some_fields(RELEASE_MODELS.find(preset).settings_type, rng, 0.02)
+            if "pacing" in fields:
+                fields["pacing"] = one_of(PACINGS, rng)
+            return {**fields, "preset": preset}
+    return some(hints[name], rng)
+
+
+def configuration(rng, _folder):
+    """Draw an id and keywords; return them, what is tried, and what a message may begin with."""
+    env = one_of(ENVIRONMENTS, rng)
+    env = "dptse/ShortHighway-v0" if rng.random() < 0.6 else env
+    keywords = {"horizon": 5, "traffic_seeds": [0]} if rng.random() < 0.9 else {}
+    chosen = {*rng.choice(KEYWORDS, int(rng.integers(1, 6)), replace=False)}
+    for name in KEYWORDS:  # the estimator before its settings
+        if name in chosen:
+            keywords[name] = keyword(name, rng, keywords)
+    if rng.random() < 0.02:
+        keywords = {"no_such\nkeyword": 1}  # alone, since Gymnasium repeats all of them
+    return {"id": env, **keywords}, lambda: play(env, keywords), PATHS
+
+
+def play(env, keywords, n_steps=3):
+    """Make an environment and, where its records are small, play a few steps."""
+    made = gym.make(f"dptse_env:{env}", **keywords)
+    bare, corridor = made.unwrapped, made.unwrapped.config.corridor
+    assert bare.process.n_episodes == 1
+    size = corridor.duration * corridor.n_segments
+    if size > SHORT_HIGHWAY.duration * SHORT_HIGHWAY.n_segments * 4 and corridor not in (
+        CORRIDORS.values()
+    ):
+        return  # SUMO would take most of the time
+    observation, _ = made.reset(seed=0)
+    made.action_space.seed(0)
+    for _ in range(min(n_steps, bare.config.horizon_steps)):
+        assert made.observation_space.contains(observation)
+        observation, reward, *_ = made.step(made.action_space.sample())
+        assert math.isfinite(reward)
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def roads(rng, folder):
+    """Draw a road file."""
+    path = folder / "road.toml"
+    table = {"bandwidth": 2, "horizon": 5, "traffic_seeds": [0], "estimator": "ekf",
+             "observation": ["default"], "privacy": {"preset": "paced", "pacing": "tracer"},
+             "estimator_settings": {"process_noise": [0.01, 0.01]}}  # fmt: skip
+    write_corridor(path, dataclasses.replace(SHORT_HIGHWAY, duration=60, incident=None), table)
+    path.write_bytes(changed(path.read_bytes(), rng))
+    return path.read_bytes(), lambda: play("dptse/ShortHighway-v0", {"corridor": str(path)}), path
+
+
+def policies(rng, folder):
+    """Draw the file of a policy, read it and let it act."""
+    name, path = one_of(shipped_policies(), rng), folder / "policy.safetensors"
+    path.write_bytes(changed_tensors(SHIPPED / "policies" / f"{name}.safetensors", rng))
+
+    def act():
+        policy, card = find_policy(str(path)), read_policy(name).card
+        env = gym.make(card["env"], **{**card["keywords"], **policy.keywords})
+        acting = policy.load(env, allow=("corridor", "bandwidth"))
+        observation = np.zeros(env.observation_space.shape, np.float32)
+        assert env.action_space.contains(acting.predict(observation, deterministic=True)[0])
+
+    return path.read_bytes(), act, path
+
+
+def weights(rng, folder):
+    """Draw the file of a recurrent network, and play with it."""
+    shipped = sorted((SHIPPED / "estimators" / "networks").glob("*.safetensors"))
+    path = folder / "network.safetensors"
+    path.write_bytes(changed_tensors(one_of(shipped, rng), rng))
+    settings = {"recurrent": {"weights": str(path), "outside": True}}
+    keywords = {"estimator": "recurrent", "estimator_settings": settings, "traffic_seeds": [0]}
+    return path.read_bytes(), lambda: play("dptse/ShortHighway-v0", keywords), path
+
+
+def imported(folder):
+    """Import a small recording; return the road file."""
+    path = plain(folder / "a.csv", stream(seconds=45.0, period=0.5))
+    split = [Split("training", 1.0, range(1000))]
+    environment = {"bandwidth": 2, "horizon": 5, "traffic_seeds": [0]}
+    import_trajectories([path], PLAIN, STRAIGHT, folder / "new", split, environment=environment)
+    return folder / "new" / "road.toml"
+
+
+def records(rng, folder):
+    """Draw a record in a folder of recordings, and play it."""
+    road = imported(folder)
+    path = road.parent / "records" / "00000000.safetensors"
+    path.write_bytes(changed_tensors(path, rng))
+    return (
+        path.read_bytes(), lambda: play("dptse/ShortHighway-v0", {"corridor": str(road)}), path
+    )  # fmt: skip
+
+
+KINDS_OF_TRAJECTORIES = ("csv", "csv.gz", "txt", "json", "xml", "parquet")
+
+
+def trajectories(rng, folder):
+    """Draw a file of trajectories in one of several formats, and import it."""
+    points, kind = stream(seconds=45.0, period=0.5), one_of(KINDS_OF_TRAJECTORIES, rng)
+    path, source = folder / f"a.{kind}", PLAIN
+    text = plain(folder / "plain.txt", points).read_bytes()
+    if kind == "parquet":
+        text = io.BytesIO()
+        pl.read_csv(folder / "plain.txt").write_parquet(text)
+        text = text.getvalue()
+    if kind == "txt":
+        source = Source("ngsim")
+        text = "\n".join(text_of_ngsim(points)).encode()
+    if kind == "json":
+        source = Source("i24", layout=Layout(origin=0.0))
+        documents = [
+            {"_id": int(each), "direction": 1,
+             "timestamp": (points[points[:, 0] == each, 1]).round(4).tolist(),
+             "x_position": (points[points[:, 0] == each, 2] / 0.3048).round(3).tolist(),
+             "y_position": [0.0] * int((points[:, 0] == each).sum())}
+            for each in np.unique(points[:, 0])
+        ]  # fmt: skip
+        text = json.dumps(documents).encode()
+    if kind == "xml":
+        source = Source("fcd")
+        steps = []
+        for second in np.unique(points[:, 1]):
+            here = points[points[:, 1] == second]
+            vehicles = "\n".join(
+                f'<vehicle id="{int(v)}" lane="main_{int(x // 100)}_0" pos="{x % 100:.3f}" '
+                f'speed="{speed}"/>'
+                for v, _, x, speed in here
+            )
+            steps.append(f'<timestep time="{second:.2f}">\n{vehicles}\n</timestep>')
+        text = ("<fcd>\n" + "\n".join(steps) + "\n</fcd>").encode()
+    text = changed(text, rng)
+    path.write_bytes(gzip.compress(text) if kind == "csv.gz" else text)
+    return (
+        path.read_bytes(),
+        lambda: import_trajectories([path], source, STRAIGHT, folder / "new", SPLITS),
+        path,
+    )
+
+
+def fields(rng, folder):
+    """Draw a table of a measured field, and import it."""
+    density, speed = folder / "density.txt", folder / "speed.txt"
+    np.savetxt(density, rng.uniform(20.0, 60.0, (8, 40)), fmt="%.4g")
+    np.savetxt(speed, rng.uniform(60.0, 100.0, (8, 40)), fmt="%.4g")
+    path = one_of([density, speed], rng)
+    path.write_bytes(changed(path.read_bytes(), rng))
+    source = FieldSource(density, cell=0.05, interval=5.0, speed=speed)
+    road = FieldRoad("measured", segments=2, lanes=3, speed_limit=100.0)
+    return (
+        path.read_bytes(),
+        lambda: import_field(source, road, folder / "new", SPLITS, 40),
+        folder,  # of two files that do not fit one another either may be named
+    )
+
+
+def cards(rng, folder):
+    """Draw a JSON or TOML file of parameters, settings, a mapping or a manifest, and use it."""
+    kind = one_of(["parameters", "estimator_settings", "source", "manifest"], rng)
+    path = folder / f"{kind}.json"
+    keywords = {kind: str(path), "horizon": 5, "traffic_seeds": [0]}
+    if kind == "parameters":
+        write_parameters(path, load_parameters("w99-3lane"), {"by": "hand"})
+    elif kind == "estimator_settings":
+        settings = dataclasses.asdict(load_settings("ekf-w99-3lane-paced"))
+        settings.pop("demand")
+        write_settings(
+            path, estimator="ekf", parameters="w99-3lane", privacy="paced", settings=settings,
+            provenance={},
+        )  # fmt: skip
+    elif kind == "manifest":
+        road = imported(folder)
+        path = road.parent / "manifest.json"
+        keywords = {"corridor": str(road)}
+    else:
+        path.write_text(
+            'format = "table"\nframe_rate = 25\ngroups = [1, "a"]\n[columns]\ntime = "t"\n'
+            '[units]\nspeed = "m/s"\n[layout]\norigin = 1.0\ncentre_line = [[0, 0], [1, 1]]\n'
+            "[layout.mainline]\nlanes = [1, 2]\nlateral = [0.0, 3.5]\n"
+        )
+    path.write_bytes(changed(path.read_bytes(), rng))
+    use = (
+        (lambda: read_source(path))
+        if kind == "source"
+        else (lambda: play("dptse/ShortHighway-v0", keywords))
+    )
+    return path.read_bytes(), use, path
+
+
+@cache
+def town():
+    """A SUMO network with its routes and configuration, as a folder."""
+    folder = Path(tempfile.mkdtemp(prefix="dptse-fuzz-town-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    motorway(folder)
+    (folder / "town.sumocfg").write_text(
+        '<configuration>\n<input>\n<net-file value="road.net.xml"/>\n'
+        '<route-files value="road.rou.xml"/>\n</input>\n<time>\n<begin value="0"/>\n'
+        '<step-length value="0.5"/>\n</time>\n</configuration>\n'
+    )
+    return folder
+
+
+def networks(rng, folder):
+    """Draw a SUMO network, its routes or its configuration, and import the road."""
+    shutil.copytree(town(), folder, dirs_exist_ok=True)
+    path = folder / one_of(["road.net.xml", "road.rou.xml", "town.sumocfg"], rng)
+    path.write_bytes(changed(path.read_bytes(), rng))
+
+    def use():
+        files = read_configuration(folder / "town.sumocfg")
+        import_road(files, find_layout(files, PATH, 100.0), "motorway", 30)
+
+    return path.read_bytes(), use, folder  # what one file lacks another may be blamed for
+
+
+FILES = {
+    each.__name__: each
+    for each in (roads, policies, weights, records, trajectories, fields, cards, networks)
+}
+KINDS = {"configurations": configuration, **FILES}
+
+
+# --- verdicts -------------------------------------------------------------------------------------
+
+
+def verdict(use, place):
+    """Try a case: "worked", "refused: ...", or "escaped: ..." with what happened.
+
+    Args:
+        use: What is tried.
+        place: The file, or what a message may begin with.
+    """
+    began, before = time.process_time(), resident("VmRSS", reset=True)
+    try:
+        # The limit only guards the machine: threads reserve more than they use.
+        with warnings.catch_warnings(), little_memory(8 * MEMORY):
+            warnings.simplefilter("ignore")
+            use()
+        said = "worked"
+    except ValueError as problem:
+        said = judged(str(problem), place)
+    except BaseException as problem:
+        line = " ".join(traceback.format_exception_only(problem)[-1].split())
+        where = traceback.extract_tb(problem.__traceback__)[-1]
+        said = f"escaped: {line:.300} ({where.filename}:{where.lineno})"
+    took, more = time.process_time() - began, resident("VmHWM") - before
+    if took > LONGEST or more > MEMORY:
+        return f"escaped: it took {took:.1f} s and {more / 2**20:.0f} MB, {said:.200}"
+    return said
+
+
+def resident(name, reset=False):
+    """Return the memory [bytes] of this process, now (VmRSS) or at its peak since a reset (VmHWM).
+
+    Elsewhere than on Linux it is 0.
+    """
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return 0
+    if reset:
+        Path("/proc/self/clear_refs").write_text("5")
+    return 1024 * int(re.search(rf"{name}:\s+(\d+)", status.read_text())[1])
+
+
+def judged(message, place):
+    """Say whether a message has one line, a path, and not too many words."""
+    if isinstance(place, Path):
+        has_path, length = str(place) in message, len(message.replace(str(place), ""))
+    else:
+        has_path, length = message.startswith(tuple(place)), len(message)
+    if len(message.splitlines()) != 1:
+        return f"escaped: {len(message.splitlines())} lines: {message:.300}"
+    if not has_path:
+        return f"escaped: no path: {message:.300}"
+    if length > LONGEST_MESSAGE:
+        return f"escaped: {length} characters: {message:.300}"
+    return f"refused: {message}"
+
+
+def try_case(seed, kind, number):
+    """Draw a case and try it; return a verdict, and what was drawn."""
+    rng = np.random.default_rng([seed, [*KINDS].index(kind), number])
+    folder = Path(tempfile.mkdtemp(prefix="dptse-fuzz-"))
+    try:
+        drawn, use, place = KINDS[kind](rng, folder)
+        said = verdict(use, place)
+        if "escaped: it took" in said:
+            said = verdict(use, place)  # kernels were compiled, perhaps
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return said, drawn
+
+
+def serve(connection):
+    """Try the cases that come through a pipe, and answer each."""
+    with contextlib.suppress(EOFError):
+        while True:
+            connection.send(try_case(*connection.recv())[0])
+
+
+class Worker:
+    """A process that tries cases, and is replaced when it dies or takes no end."""
+
+    def __init__(self):
+        self._process = None
+
+    def ask(self, case):
+        """Return the verdict on a case."""
+        if self._process is None:
+            self._pipe, other = multiprocessing.Pipe()
+            context = multiprocessing.get_context("spawn")
+            self._process = context.Process(target=serve, args=(other,))
+            self._process.start()
+            other.close()
+        self._pipe.send(case)
+        try:
+            if self._pipe.poll(PATIENCE):
+                return self._pipe.recv()
+            said = f"escaped: it did not end in {PATIENCE:g} s"
+        except EOFError:
+            self._process.join()
+            said = f"escaped: it ended the process, exit code {self._process.exitcode}"
+        self.close()
+        return said
+
+    def close(self):
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._process = None
+
+
+def cases(configurations, files):
+    """Kinds and numbers of as many cases; files are of all kinds in turn."""
+    kinds = [*FILES]
+    yield from (("configurations", number) for number in range(configurations))
+    yield from ((kinds[n % len(kinds)], n // len(kinds)) for n in range(files))
+
+
+def main(words=None):
+    """Try all cases; print figures and what has escaped. Return the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--configurations", type=int, default=1000)
+    parser.add_argument("--files", type=int, default=400)
+    parser.add_argument("--only", metavar="KIND:NUMBER", help="one case, with what was drawn")
+    args = parser.parse_args(words)
+    if args.only:
+        kind, _, number = args.only.partition(":")
+        said, drawn = try_case(args.seed, kind, int(number))
+        print(drawn, said, sep="\n")
+        return int(said.startswith("escaped"))
+    figures, worker = Counter(), Worker()
+    try:
+        for kind, number in cases(args.configurations, args.files):
+            said = worker.ask((args.seed, kind, number))
+            figures[kind, said.partition(":")[0]] += 1
+            if said.startswith("escaped"):
+                print(f"{kind}:{number} {said}", flush=True)
+    finally:
+        worker.close()
+    print_figures(figures)
+    return int(any(outcome == "escaped" for _, outcome in figures))
+
+
+def print_figures(figures: Mapping[tuple[str, str], int]) -> None:
+    """Print how many cases of each kind worked, were refused and escaped."""
+    outcomes = ("worked", "refused", "escaped")
+    print(f"{'kind':15}{'tried':>9}", *(f"{each:>9}" for each in outcomes))
+    for kind in KINDS:
+        counts = [figures[kind, each] for each in outcomes]
+        print(f"{kind:15}{sum(counts):9}", *(f"{each:9}" for each in counts))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

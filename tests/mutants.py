@@ -1,0 +1,688 @@
+"""Mutants: one-line changes, each of which breaks a line of the proof and must fail a fast test.
+
+``python -m tests.mutants`` makes them one by one in a copy of the repository, runs the tests of
+their module there, and prints which test has caught each; with words only the mutants whose name,
+file or line of the proof has one of them. It ends with status 1 where a mutant lives, which is a
+missing test, or where tests fail without one. It takes some ten minutes: run it after a change to
+what ``docs/proof.md`` names.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from dptse_env.utils.kernels import default_folder
+
+ROOT = Path(__file__).parents[1]
+SPARED = (".*", "__pycache__", "build", "dist", "results")
+"""What no copy needs, at any depth."""
+
+MOST_SECONDS = 600.0
+"""Time for the tests of a mutant, which may compile a kernel."""
+
+UNSOUND = re.compile(r"(numba\.|Attribute|Index|Key|Name|Type|UnboundLocal)")
+"""How tests fail where a mutant is no sound Python, which shows nothing."""
+
+
+class Mutant(NamedTuple):
+    """A one-line change of the package.
+
+    Attributes:
+        name: What is wrong with it.
+        line: Line of the proof in ``docs/proof.md`` that it breaks.
+        path: File below ``dptse_env``.
+        old: Text that stands there exactly once.
+        new: What takes its place.
+        tests: Files below ``tests``, a fast test of which must fail.
+    """
+
+    name: str
+    line: int
+    path: str
+    old: str
+    new: str
+    tests: str
+
+    @property
+    def file(self) -> Path:
+        """The file that is changed, below the root."""
+        return Path("dptse_env", self.path)
+
+    def applied(self, text: str) -> str:
+        """Return the text of the file with the change.
+
+        Raises:
+            ValueError: The old text is not found, or more than once.
+        """
+        if text.count(self.old) != 1:
+            raise ValueError(
+                f"{self.path} has {text.count(self.old)} times what mutant {self.name!r} changes: "
+                f"{self.old!r}"
+            )
+        return text.replace(self.old, self.new)
+
+
+MUTANTS = (
+    # --- two worlds ---------------------------------------------------------------------------
+    Mutant(
+        "who is connected depends on how many vehicles there are", 1, "traffic/penetration.py",
+        "uniform = self._uniform(traffic_seed, 0, record.n_vehicles)",
+        "uniform = self._uniform(traffic_seed, 0, record.n_vehicles)[::-1]",
+        "traffic/test_penetration.py",
+    ),
+    Mutant(
+        "the mask of answers shows empty segments", 2, "release/paced.py",
+        "return Measurement(observed, values, sigma, centre)",
+        "return Measurement(observed & (sums[..., 0] > 0.0), values, sigma, centre)",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "ledgers are in info", 2, "process.py",
+        "**self.release.public(episodes),",
+        "**self.release.public(episodes), **self.release.private(episodes, 0 * episodes),",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "refusals are in info", 2, "release/paced.py",
+        '"centre_fallback": self._fallback[episodes],',
+        '"centre_fallback": self._fallback[episodes] + self._refused[episodes, 0],',
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "an empty segment has a mean speed of its own", 2, "release/gaussian.py",
+        "np.where(counts == 0.0, task.limit,", "np.where(counts == 0.0, 0.0,",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "truth in info voids nothing", 2, "parts.py",
+        'shown = ("truth_in_info",) if config.truth_in_info else ()', "shown = ()",
+        "release/test_report.py",
+    ),
+    Mutant(
+        "a report that is void still states its guarantee", 2, "release/report.py",
+        'replace(self, guarantee="none", ', "replace(self, ",
+        "release/test_report.py",
+    ),
+    Mutant(
+        "centres are true speeds", 3, "release/paced.py",
+        "predicted, centre = self._predicted(request)",
+        "predicted, centre = self._predicted(request); "
+        "centre[:, : self._limits.size] = "
+        "self.traffic.aggregates(request.traffic, request.times)[..., 1]",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "prices follow true densities", 3, "release/paced.py",
+        "prices = self.pacing.prices(episodes, observed, *predicted)",
+        "prices = self.pacing.prices(episodes, observed, *np.moveaxis("
+        "self.traffic.aggregates(request.traffic, request.times), -1, 0))",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "prices follow true ledgers", 3, "release/paced.py",
+        "prices = self.pacing.prices(episodes, observed, *predicted)",
+        "prices = self.pacing.prices(episodes, observed, *predicted) "
+        "/ (1.0 + self.ledgers.paid[episodes].max())",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "a boundary segment has another centre than the segment beside it", 3, "release/paced.py",
+        "centre[k, n_segments + r] = centre[k, neighbours[r]]",
+        "centre[k, n_segments + r] = 0.5 * fastest",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "the price level is ignored", 3, "release/pacing.py",
+        "price *= columns.level[c] / columns.span[c]", "price /= columns.span[c]",
+        "release/test_pacing.py",
+    ),
+    # --- one vehicle --------------------------------------------------------------------------
+    Mutant(
+        "two vehicles share a ledger", 4, "release/vehicles.py",
+        "s, v = place[row], vehicle[row]", "s, v = place[row], vehicle[row] // 2",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "a segment answers for three vehicles at most", 4, "release/vehicles.py",
+        "if ledgers[g, v] + cost <= budget[g]:",
+        "if ledgers[g, v] + cost <= budget[g] and counts[c] < 3:",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "the grid of deviations is coarser than one km/h", 5, "release/noise.py",
+        "return min(float(np.int64(bits).view(np.float64)), COARSEST)",
+        "return float(np.int64(bits).view(np.float64))",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "deviations are rounded to the grid of another column", 5, "release/vehicles.py",
+        "grid[c] = grid_of(sigma[k, c, 1])", "grid[c] = grid_of(sigma[k, 0, 1])",
+        "release/test_vehicles.py release/test_paced.py",
+    ),
+    Mutant(
+        "sums that doubles cannot hold are not refused", 5, "release/vehicles.py",
+        "steps * MOST_VEHICLES < 2.0**52,", "True,",
+        "release/test_vehicles.py",
+    ),
+    Mutant(
+        "a record of too many vehicles is not refused", 5, "release/vehicles.py",
+        "record.n_vehicles <= MOST_VEHICLES,", "True,",
+        "release/test_vehicles.py",
+    ),
+    Mutant(
+        "a deviation is charged before it is rounded", 6, "release/vehicles.py",
+        "d = steps * grid[c]",
+        "d = min(max(min(reported, fastest) - centre[k, s], -clip), clip)",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "a deviation at the clip is rounded up", 6, "release/vehicles.py",
+        "most = np.floor(clip / grid[c])", "most = np.ceil(clip / grid[c])",
+        "release/test_vehicles.py release/test_paced.py",
+    ),
+    Mutant(
+        "deviations are charged unclipped and released clipped", 6, "release/vehicles.py",
+        "d = steps * grid[c]", "d = min(reported, fastest) - centre[k, s]",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "deviations are charged clipped and released unclipped", 6, "release/vehicles.py",
+        "deviations[c] += np.int64(steps)",
+        "deviations[c] += np.int64((min(reported, fastest) - centre[k, s]) / grid[c])",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "a vehicle is charged for being counted alone", 6, "release/vehicles.py",
+        "prices[k, c] * (1.0 + ratio * d * d / (clip * clip))", "prices[k, c]",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "the noise of deviations does not follow the ratio", 6, "release/paced.py",
+        "self._flow_noise = settings.clip / math.sqrt(settings.ratio)",
+        "self._flow_noise = settings.clip",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "overlaps are charged once", 7, "release/vehicles.py",
+        "ledgers[g, v] += cost", "ledgers[g, v] += cost if i == 0 else 0.0",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "a ratio of two is allowed under replace", 8, "release/paced.py",
+        "if self.ratio > 1.0 and", "if self.ratio > 2.0 and",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "the budget is not halved under replace", 8, "release/paced.py",
+        'self._squares = 2.0 if settings.adjacency == "replace" else 1.0', "self._squares = 1.0",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "budgets of replace and of add_remove are exchanged", 9, "release/paced.py",
+        'self._squares = 2.0 if settings.adjacency == "replace" else 1.0',
+        'self._squares = 1.0 if settings.adjacency == "replace" else 2.0',
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "vehicles that are not connected are counted", 9, "release/vehicles.py",
+        "if reported < 0.0:", "if reported < -1.0:",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "a ledger goes with the segment", 10, "release/vehicles.py",
+        "s, v = place[row], vehicle[row]",
+        "s, v = place[row], (vehicle[row] + place[row]) % paid.shape[2]",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "ledgers are kept over a reset", 10, "release/vehicles.py",
+        "self.paid[episodes] = 0.0", "self.paid = self.paid.copy()",
+        "release/test_vehicles.py release/test_paced.py",
+    ),
+    Mutant(
+        "a paced reset clears the ledgers of its first episode alone", 10, "release/paced.py",
+        "self.ledgers.reset(episodes, self.traffic.n_vehicles)",
+        "self.ledgers.reset(episodes[:1], self.traffic.n_vehicles)",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "a capped reset clears the ledgers of its first episode alone", 10, "release/gaussian.py",
+        "self.ledgers.reset(episodes, self.traffic.n_vehicles)",
+        "self.ledgers.reset(episodes[:1], self.traffic.n_vehicles)",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "a wider record clears the ledgers of all episodes", 10, "release/vehicles.py",
+        "wider[..., : self.paid.shape[2]] = self.paid", "wider[:] = 0.0",
+        "release/test_vehicles.py",
+    ),
+    Mutant(
+        "a trip has a budget for every second", 10, "release/paced.py",
+        'if self.task.settings.unit == "event":  # every', "if True:  # every",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "the last payment overdraws the ledger", 11, "release/vehicles.py",
+        "if ledgers[g, v] + cost <= budget[g]:", "if ledgers[g, v] <= budget[g]:",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "a refused contribution is added", 11, "release/vehicles.py",
+        "refused[k, g] += 1", "refused[k, g] += 1; counts[c] += 1",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "a vehicle counts once more than the cap", 12, "release/gaussian.py",
+        "math.inf if cap is None else float(cap)", "math.inf if cap is None else cap + 1.0",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "flows are not centred on the middle of the speeds", 12, "release/gaussian.py",
+        "return 0.5 * corridor.largest_speed_limit if",
+        "return 0.4 * corridor.largest_speed_limit if",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "speeds are not clipped to the limit", 12, "release/gaussian.py",
+        "fastest = task.corridor.largest_speed_limit", "fastest = math.inf",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "two speeds on one segment are taken for speeds on two", 12, "privacy/sensitivity.py",
+        "same_segment = 2.0 * flow", "same_segment = math.sqrt(2.0) * flow",
+        "privacy/test_sensitivity.py release/test_gaussian.py",
+    ),
+    Mutant(
+        "the noise is that of the longest segment", 12, "release/gaussian.py",
+        "segment_length=min(corridor.segment_lengths),\n            largest_speed",
+        "segment_length=max(corridor.segment_lengths),\n            largest_speed",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "the ledger of a second is not cleared", 13, "release/paced.py",
+        'if self.task.settings.unit == "event":  # every', "if False:  # every",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "overlapping queries of a second do not divide its budget", 13, "release/pacing.py",
+        "most = max(most, total[g, s] + own)", "most = max(most, own)",
+        "release/test_pacing.py",
+    ),
+    Mutant(
+        "a trip without a cap has the noise of one that is capped", 13, "release/gaussian.py",
+        '"horizon": horizon, "event": 1}', '"horizon": self.cap, "event": 1}',
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "each group of a paced release has the whole budget", 14, "release/paced.py",
+        "mu_of(settings.epsilon, settings.delta) * np.sqrt(task.shares)",
+        "mu_of(settings.epsilon, settings.delta) * np.ones_like(task.shares)",
+        "release/test_sensors.py",
+    ),
+    Mutant(
+        "queries have the whole budget beside the sensors' part", 14, "release/sensors.py",
+        'Group("queries", 1.0 - share, penetration)', 'Group("queries", 1.0, penetration)',
+        "release/test_sensors.py",
+    ),
+    Mutant(
+        "sensors have the noise of queries", 14, "release/gaussian.py",
+        "self.noise_std[task.group]", "self.noise_std[0 * task.group]",
+        "release/test_gaussian.py",
+    ),
+    # --- noise --------------------------------------------------------------------------------
+    Mutant(
+        "the grid follows the value", 15, "release/noise.py",
+        "grid_of(sigma[k, c, q])\n                ratio",
+        "grid_of(sigma[k, c, q] + abs(values[k, c, q]))\n                ratio",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "noise is added unrounded", 15, "release/noise.py",
+        "steps = np.rint(ratio * z)", "steps = ratio * z",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "the noise is too small", 15, "release/noise.py",
+        "ratio = scale * sigma[k, c, q] / grid", "ratio = 0.95 * scale * sigma[k, c, q] / grid",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "integers in doubt are not settled", 16, "release/noise.py",
+        "if some_open and given is None:", "if False:",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "no integer is ever in doubt", 16, "release/noise.py",
+        "margin < ratio * (1.0 + size) * doubt", "margin < 0.0",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "doubt does not grow with the scale", 16, "release/noise.py",
+        "margin < ratio * (1.0 + size) * doubt", "margin < (1.0 + size) * doubt",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "far numbers are not in doubt", 16, "release/noise.py",
+        "is_open = size > FAR or margin", "is_open = margin",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "what is settled has one sign", 16, "release/noise.py",
+        "return -found if bits & 1 else found", "return found",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "the further bits are zeros", 16, "release/noise.py",
+        "tail << 64 | more(),", "tail << 64 | 0 * more(),",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "a number is settled by the bits of the next second", 16, "release/noise.py",
+        "self._next[row] - 1, c, q", "self._next[row], c, q",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "counts and deviations have one noise", 17, "release/noise.py",
+        "z = normal[episodes[k], step, c, q]", "z = normal[episodes[k], step, c, 0]",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "two columns have one noise", 17, "release/noise.py",
+        "z = normal[episodes[k], step, c, q]", "z = normal[episodes[k], step, c // 2 * 2, q]",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "queries and fixed sensors have one noise", 17, "release/noise.py",
+        "z = normal[episodes[k], step, c, q]", "z = normal[episodes[k], step, c % 8, q]",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "all episodes of a batch have one noise", 17, "release/noise.py",
+        "z = normal[episodes[k], step, c, q]", "z = normal[0, step, c, q]",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "noise comes again after its block", 17, "release/noise.py",
+        'was released before its first reset")\n            self._draw(row, generator)',
+        'was released before its first reset")\n            self._next[row] = 0',
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "noise is drawn by what is queried", 17, "release/gaussian.py",
+        "k = len(values)",
+        "k = len(values); request.observed[0, 0] or self.noise.added("
+        "request.episodes, values, self.added_std[:k], self.unit)",
+        "test_streams.py",
+    ),
+    Mutant(
+        "the estimator draws from the stream of the noise", 17, "process.py",
+        "self.estimator.reset(episodes, prior, for_estimator)",
+        "self.estimator.reset(episodes, prior, for_noise)",
+        "test_streams.py",
+    ),
+    Mutant(
+        "noise is drawn from the stream of the traffic", 17, "process.py",
+        "self.release.reset(episodes, for_noise)", "self.release.reset(episodes, for_traffic)",
+        "test_streams.py",
+    ),
+    Mutant(
+        "errors of detectors are drawn from the stream of the noise", 17, "process.py",
+        "self.detectors.reset(episodes, for_detectors)",
+        "self.detectors.reset(episodes, for_noise)",
+        "release/test_sensors.py",
+    ),
+    Mutant(
+        "streams are spawned from 32 bits", 17, "process.py",
+        "generator.integers(2**32, size=4,", "generator.integers(2**32, size=1,",
+        "test_streams.py",
+    ),
+    Mutant(
+        "secure noise follows the seed", 18, "release/noise.py",
+        "np.frombuffer(os.urandom(bits.nbytes), dtype=np.uint64)",
+        "np.frombuffer(generator.bytes(bits.nbytes), dtype=np.uint64)",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "the further bits of secure noise follow the seed", 18, "release/noise.py",
+        "if self._is_secure or generator is None:", "if generator is None:",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "paced noise is never secure", 18, "release/paced.py",
+        "Noise(n, task.n_columns, settings.noise)", "Noise(n, task.n_columns)",
+        "test_streams.py",
+    ),
+    Mutant(
+        "capped noise is never secure", 18, "release/gaussian.py",
+        "Noise(n, task.n_columns, task.settings.noise)", "Noise(n, task.n_columns)",
+        "test_streams.py",
+    ),
+    Mutant(
+        "a process with secure noise can be forked", 18, "process.py",
+        'if self.config.privacy.noise == "secure":', "if False:",
+        "test_streams.py",
+    ),
+    Mutant(
+        "a seeded guarantee does not say so", 18, "release/base.py",
+        'against = "" if self.noise == "secure" else', 'against = "" if self.noise else',
+        "release/test_paced.py",
+    ),
+    # --- from distances to the guarantee ------------------------------------------------------
+    Mutant(
+        "the estimator reads a second before the centres are taken", 19, "process.py",
+        "measured = self.measure(request)",
+        "self.estimator.update(episodes, self.fork().measure(request)); "
+        "measured = self.measure(request)",
+        "test_process.py",
+    ),
+    Mutant(
+        "the estimator begins at the true state", 20, "process.py",
+        "prior = nominal_state(self.config.corridor, self.model, self.time[episodes])",
+        "prior = self.model.states(*np.moveaxis(self.truth(episodes), -1, 0))",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "nominal boundary inputs are the true ones", 20, "release/boundary.py",
+        '"nominal": NominalBoundary,', '"nominal": TrueBoundary,',
+        "release/test_boundary.py",
+    ),
+    Mutant(
+        "true boundary inputs void nothing", 20, "release/boundary.py",
+        'void_reasons: ClassVar[tuple[str, ...]] = ("boundary_inputs",)', "pass",
+        "release/test_report.py",
+    ),
+    Mutant(
+        "released boundary flows are read around the reference speed", 20, "release/boundary.py",
+        "np.maximum(density, self._least_density) + centre",
+        "np.maximum(density, self._least_density) + model.reference_speed",
+        "release/test_boundary.py",
+    ),
+    Mutant(
+        "the noise of an answer is not divided by the share", 20, "release/fusion.py",
+        "sigma[:, queries, 0] = np.sqrt((sigma[:, queries, 0] / p) ** 2 + sampling)",
+        "sigma[:, queries, 0] = np.sqrt(sigma[:, queries, 0] ** 2 + sampling)",
+        "release/test_fusion.py",
+    ),
+    Mutant(
+        "the noise of a flow is not divided by the share", 20, "release/fusion.py",
+        "np.sqrt((sigma[:, queries, 1] / p) ** 2 + sampling * square)",
+        "np.sqrt(sigma[:, queries, 1] ** 2 + sampling * square)",
+        "release/test_fusion.py",
+    ),
+    Mutant(
+        "density and flow have the noise that each needs alone", 21, "privacy/gaussian.py",
+        "shares = share, 1.0 - share", "shares = 1.0, 1.0",
+        "privacy/test_gaussian.py",
+    ),
+    Mutant(
+        "the noise of flows forgets two speeds on one segment", 21, "privacy/gaussian.py",
+        "max(bound / math.sqrt(part), largest) / mu", "bound / math.sqrt(part) / mu",
+        "privacy/test_gaussian.py",
+    ),
+    Mutant(
+        "mu is that of a single one-sided bound", 21, "privacy/gaussian.py",
+        "return float(log_ndtr(upper)) + math.log1p(-lower_over_upper)",
+        "return float(log_ndtr(upper)) + 2.0 * math.log1p(-lower_over_upper)",
+        "privacy/test_gaussian.py",
+    ),
+    Mutant(
+        "ledgers keep nothing back for rounding", 22, "release/paced.py",
+        "(1.0 - ROUNDING) * self.budget", "self.budget",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "capped noise keeps nothing back for rounding", 22, "release/gaussian.py",
+        "factor = (1.0 + ROUNDING) / math.sqrt", "factor = 1.0 / math.sqrt",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "an episode may have more payments than the reserve covers", 22, "release/paced.py",
+        "require_covered(task.horizon * int(task.covers.sum(axis=0).max()))",
+        "require_covered(task.horizon)",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "the reserve covers any number of payments", 22, "privacy/gaussian.py",
+        "require(payments <= MOST_PAYMENTS,", "require(True,",
+        "privacy/test_gaussian.py",
+    ),
+    Mutant(
+        "the next episode of an environment has the noise of the last", 23, "process.py",
+        "generator.integers(2**32, size=4,", "copy.deepcopy(generator).integers(2**32, size=4,",
+        "test_streams.py",
+    ),
+    Mutant(
+        "an observation begins with the last release of the episode before", 23, "process.py",
+        "self.released[episodes] = 0.0", "self.released = self.released.copy()",
+        "test_streams.py",
+    ),
+    Mutant(
+        "innovations outlast a reset", 23, "estimators/base.py",
+        "self.innovations[episodes] = 0.0", "self.innovations = self.innovations.copy()",
+        "test_streams.py",
+    ),
+    Mutant(
+        "the boundary remembers the release of the episode before", 23, "release/boundary.py",
+        "self._has_release[episodes] = False", "self._has_release = self._has_release.copy()",
+        "release/test_boundary.py",
+    ),
+    Mutant(
+        "the tracer outlasts a reset", 23, "release/pacing.py",
+        "self._tracer[episodes] = 0.0", "self._tracer = self._tracer.copy()",
+        "release/test_pacing.py release/test_paced.py",
+    ),
+    Mutant(
+        "what is spent leaves out queries that overlap", 24, "release/paced.py",
+        "paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price",
+        "paid[accounts.group[c], s] = (1.0 + accounts.ratio) * price",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "what is spent is the largest of a group", 24, "release/paced.py",
+        "np.sqrt(squares.sum(axis=1))", "np.sqrt(squares.max(axis=1))",
+        "release/test_sensors.py",
+    ),
+    Mutant(
+        "what is spent is the largest of a second", 24, "release/paced.py",
+        "if accounts.is_event else charged[g] + largest", "",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "what is spent is a vehicle's payment at the predicted speed", 24, "release/paced.py",
+        "paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price",
+        "paid[accounts.group[c], s] += price",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "epsilon is rounded down to a level of mu", 24, "privacy/gaussian.py",
+        "level = np.ceil(", "level = np.floor(",
+        "privacy/test_gaussian.py",
+    ),
+)  # fmt: skip
+
+
+def lines_of_the_proof() -> dict[int, str]:
+    """Return the titles of the lines of the proof by their numbers."""
+    page = (ROOT / "docs" / "proof.md").read_text(encoding="utf-8")
+    return {int(n): title for n, title in re.findall(r"^### (\d+)\. (.+)$", page, re.MULTILINE)}
+
+
+def chosen(words: list[str]) -> list[Mutant]:
+    """Return the mutants whose name, file or line of the proof has one of some words."""
+    return [
+        mutant
+        for mutant in MUTANTS
+        if not words or {str(mutant.line)} & {*words}
+        or any(word in f"{mutant.name} {mutant.path}" for word in words if not word.isdigit())
+    ]  # fmt: skip
+
+
+def failed(copy: Path, tests: list[str], **environment: str) -> str:
+    """Run the fast tests of files of a copy; return the first that fails, empty if all pass.
+
+    Raises:
+        RuntimeError: They could not be run, or one failed since the code is no sound Python.
+    """
+    ended = subprocess.run(
+        [sys.executable, "-m", "pytest", "-m", "not slow", "-x", "-q", "-p", "no:cacheprovider",
+         *(f"tests/{test}" for test in tests)],
+        cwd=copy, capture_output=True, text=True, timeout=MOST_SECONDS, check=False,
+        # Without CI hypothesis would try other examples each time, and pytest cut lines short.
+        env={**os.environ, "PYTHONPATH": str(copy), "CI": "true", **environment},
+    )  # fmt: skip
+    if ended.returncode == 0:
+        return ""
+    found = re.search(r"^FAILED tests/(.+?) - (.*)$", ended.stdout, re.MULTILINE)
+    if ended.returncode != 1 or found is None or UNSOUND.match(found[2]):
+        raise RuntimeError(f"pytest ended with {ended.returncode}:\n{ended.stdout}{ended.stderr}")
+    return found[1]
+
+
+def main(words: list[str]) -> int:
+    """Make some mutants, print how each fared, and return the exit status."""
+    mutants = chosen(words)
+    if not mutants:
+        print(f"no mutant has any of {words} in its name, file or line of the proof")
+        return 1
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        copy, kernels = Path(folder, "repository"), Path(folder, "kernels")
+        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*SPARED))
+        # Kernels are found by their code: those of the user serve, and a mutant's are not kept.
+        if default_folder().is_dir():
+            shutil.copytree(default_folder(), kernels)
+        environment = {"NUMBA_CACHE_DIR": str(kernels)}
+        if found := failed(
+            copy, sorted({t for m in mutants for t in m.tests.split()}), **environment
+        ):
+            print(f"without a mutant, {found} fails")
+            return 1
+        # Bytecode of a mutant could be taken for that of the file, which has the same size.
+        environment["PYTHONDONTWRITEBYTECODE"] = "1"
+        n_lived = 0
+        print("| mutant | line of the proof | killed by | seconds |\n| :-- | :-- | :-- | --: |")
+        for mutant in mutants:
+            file, start = copy / mutant.file, time.monotonic()
+            before = file.read_text(encoding="utf-8")
+            file.write_text(mutant.applied(before), encoding="utf-8")
+            killer = failed(copy, mutant.tests.split(), **environment)
+            shutil.copy2(ROOT / mutant.file, file)
+            n_lived += not killer
+            seconds = time.monotonic() - start
+            print(
+                f"| {mutant.name} | {mutant.line} | {killer or '**lives**'} | {seconds:.0f} |",
+                flush=True,
+            )
+    print(f"\n{len(mutants) - n_lived} of {len(mutants)} mutants die")
+    return int(n_lived > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
