@@ -9,12 +9,20 @@ from agents.audit import search
 from agents.audit.attack import attack
 from agents.audit.search import Mutations, climb
 from dptse_env.parts import privacy_report
+from dptse_env.release import Paced
 from tests.agents.elsewhere import Elsewhere
 
 from .small import HalfTheLimit, config, paced
-from .test_paced_mutations import RatioOfTwo
 
 SPANS = dataclasses.replace(paced("ekf", bandwidth=4), query_spans=(1, 2), price_levels=(1.0, 2.0))
+
+
+class RatioOfTwo(Paced):
+    """Charges too little where two vehicles on one segment deviate in opposite directions."""
+
+    def __init__(self, task, traffic):
+        object.__setattr__(task.settings, "ratio", 2.0)
+        super().__init__(task, traffic)
 
 
 @pytest.fixture
