@@ -111,6 +111,8 @@ class Finding:
         else:
             few = "canaries" if result.is_one_run else "runs"
             print_text(f"too few {few} to reject this claim, however much leaks")
+        if result.mu_of_any is not None:
+            print_text(f"without independence of the noise: a mu of {result.mu_of_any:.3f} or more")
         if "boundary_inputs" in self.privacy.void_reasons:
             print_text(
                 "the estimates see the true traffic at the boundary, which makes their epsilon "
