@@ -223,8 +223,8 @@ def audit_one_run(
         seed: Seeds coins and noise, >= 0.
 
     Raises:
-        ValueError: No query leaves another segment to query, or the release model does not add its
-            noise by a `dptse_env.release.noise.Noise`.
+        ValueError: The release model does not add its noise by a
+            `dptse_env.release.noise.Noise`.
     """
     report, start = privacy_report(config), time.perf_counter()
     run = attack_in_one_run(config, record, noise_factor=noise_factor, seed=seed)
