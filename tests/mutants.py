@@ -85,6 +85,20 @@ MUTANTS = (
         "test_non_interference.py",
     ),
     Mutant(
+        "the estimator reads no answer of an empty segment", 2, "process.py",
+        "measured = self.measure(request)",
+        "measured = self.measure(request); "
+        "measured.observed[:, :15] &= self.truth(episodes)[:, :15, 0] > 0.0",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "an empty segment has a release of zero", 2, "process.py",
+        "measured = self.release.release(request)",
+        "measured = self.release.release(request); "
+        "measured.values[:, :15] *= self.truth(request.episodes)[:, :15, :1] > 0.0",
+        "test_non_interference.py",
+    ),
+    Mutant(
         "ledgers are in info", 2, "process.py",
         "**self.release.public(episodes),",
         "**self.release.public(episodes), **self.release.private(episodes, 0 * episodes),",
@@ -120,6 +134,13 @@ MUTANTS = (
         "test_non_interference.py",
     ),
     Mutant(
+        "empty segments count as those without a prediction", 3, "release/paced.py",
+        "predicted, centre = self._predicted(request)",
+        "predicted, centre = self._predicted(request); self._fallback[request.episodes] = "
+        "(self.traffic.aggregates(request.traffic, request.times)[..., 0] == 0.0).sum(axis=1)",
+        "test_non_interference.py",
+    ),
+    Mutant(
         "prices follow true densities", 3, "release/paced.py",
         "prices = self.pacing.prices(episodes, observed, *predicted)",
         "prices = self.pacing.prices(episodes, observed, *np.moveaxis("
@@ -148,13 +169,13 @@ MUTANTS = (
     Mutant(
         "two vehicles share a ledger", 4, "release/vehicles.py",
         "s, v = place[row], vehicle[row]", "s, v = place[row], vehicle[row] // 2",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a segment answers for three vehicles at most", 4, "release/vehicles.py",
         "if ledgers[g, v] + cost <= budget[g]:",
         "if ledgers[g, v] + cost <= budget[g] and counts[c] < 3:",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the grid of deviations is coarser than one km/h", 5, "release/noise.py",
@@ -178,42 +199,47 @@ MUTANTS = (
         "release/test_vehicles.py",
     ),
     Mutant(
+        "a sum is no multiple of the grid", 5, "release/vehicles.py",
+        "sums[k, c, 1] = deviations[c] * grid[c]", "sums[k, c, 1] = deviations[c] * 1.01 * grid[c]",
+        "release/test_vehicles.py",
+    ),
+    Mutant(
         "a deviation is charged before it is rounded", 6, "release/vehicles.py",
         "d = steps * grid[c]",
         "d = min(max(min(reported, fastest) - centre[k, s], -clip), clip)",
-        "release/test_paced.py",
+        "release/test_vehicles.py",
     ),
     Mutant(
         "a deviation at the clip is rounded up", 6, "release/vehicles.py",
         "most = np.floor(clip / grid[c])", "most = np.ceil(clip / grid[c])",
-        "release/test_vehicles.py release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "deviations are charged unclipped and released clipped", 6, "release/vehicles.py",
         "d = steps * grid[c]", "d = min(reported, fastest) - centre[k, s]",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "deviations are charged clipped and released unclipped", 6, "release/vehicles.py",
         "deviations[c] += np.int64(steps)",
         "deviations[c] += np.int64((min(reported, fastest) - centre[k, s]) / grid[c])",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a vehicle is charged for being counted alone", 6, "release/vehicles.py",
         "prices[k, c] * (1.0 + ratio * d * d / (clip * clip))", "prices[k, c]",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the noise of deviations does not follow the ratio", 6, "release/paced.py",
         "self._flow_noise = settings.clip / math.sqrt(settings.ratio)",
         "self._flow_noise = settings.clip",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "overlaps are charged once", 7, "release/vehicles.py",
         "ledgers[g, v] += cost", "ledgers[g, v] += cost if i == 0 else 0.0",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a ratio of two is allowed under replace", 8, "release/paced.py",
@@ -223,29 +249,34 @@ MUTANTS = (
     Mutant(
         "the budget is not halved under replace", 8, "release/paced.py",
         'self._squares = 2.0 if settings.adjacency == "replace" else 1.0', "self._squares = 1.0",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "budgets of replace and of add_remove are exchanged", 9, "release/paced.py",
         'self._squares = 2.0 if settings.adjacency == "replace" else 1.0',
         'self._squares = 1.0 if settings.adjacency == "replace" else 2.0',
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "vehicles that are not connected are counted", 9, "release/vehicles.py",
         "if reported < 0.0:", "if reported < -1.0:",
-        "release/test_paced.py",
+        "release/test_vehicles.py",
+    ),
+    Mutant(
+        "vehicles that are not connected report", 9, "traffic/penetration.py",
+        "return np.where(reports, speeds, np.float32(-1.0))", "return speeds",
+        "traffic/test_penetration.py",
     ),
     Mutant(
         "a ledger goes with the segment", 10, "release/vehicles.py",
         "s, v = place[row], vehicle[row]",
         "s, v = place[row], (vehicle[row] + place[row]) % paid.shape[2]",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "ledgers are kept over a reset", 10, "release/vehicles.py",
         "self.paid[episodes] = 0.0", "self.paid = self.paid.copy()",
-        "release/test_vehicles.py release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a paced reset clears the ledgers of its first episode alone", 10, "release/paced.py",
@@ -267,38 +298,43 @@ MUTANTS = (
     Mutant(
         "a trip has a budget for every second", 10, "release/paced.py",
         'if self.task.settings.unit == "event":  # every', "if True:  # every",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the last payment overdraws the ledger", 11, "release/vehicles.py",
         "if ledgers[g, v] + cost <= budget[g]:", "if ledgers[g, v] <= budget[g]:",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "a refused contribution is added", 11, "release/vehicles.py",
         "refused[k, g] += 1", "refused[k, g] += 1; counts[c] += 1",
-        "release/test_paced.py",
+        "test_guarantee.py",
+    ),
+    Mutant(
+        "released boundary segments are not charged", 11, "release/vehicles.py",
+        "ledgers[g, v] += cost", "ledgers[g, v] += cost if s < n_places - 4 else 0.0",
+        "test_guarantee.py",
     ),
     Mutant(
         "a vehicle counts once more than the cap", 12, "release/gaussian.py",
         "math.inf if cap is None else float(cap)", "math.inf if cap is None else cap + 1.0",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "flows are not centred on the middle of the speeds", 12, "release/gaussian.py",
         "return 0.5 * corridor.largest_speed_limit if",
         "return 0.4 * corridor.largest_speed_limit if",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "speeds are not clipped to the limit", 12, "release/gaussian.py",
         "fastest = task.corridor.largest_speed_limit", "fastest = math.inf",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "two speeds on one segment are taken for speeds on two", 12, "privacy/sensitivity.py",
         "same_segment = 2.0 * flow", "same_segment = math.sqrt(2.0) * flow",
-        "privacy/test_sensitivity.py release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "the noise is that of the longest segment", 12, "release/gaussian.py",
@@ -309,7 +345,12 @@ MUTANTS = (
     Mutant(
         "the ledger of a second is not cleared", 13, "release/paced.py",
         'if self.task.settings.unit == "event":  # every', "if False:  # every",
-        "release/test_paced.py",
+        "test_guarantee.py",
+    ),
+    Mutant(
+        "a capped second depends on how often a vehicle counted before", 13, "release/gaussian.py",
+        'return self.cap if self.unit == "trip" else None', "return self.cap",
+        "test_guarantee.py",
     ),
     Mutant(
         "overlapping queries of a second do not divide its budget", 13, "release/pacing.py",
@@ -319,23 +360,34 @@ MUTANTS = (
     Mutant(
         "a trip without a cap has the noise of one that is capped", 13, "release/gaussian.py",
         '"horizon": horizon, "event": 1}', '"horizon": self.cap, "event": 1}',
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "each group of a paced release has the whole budget", 14, "release/paced.py",
         "mu_of(settings.epsilon, settings.delta) * np.sqrt(task.shares)",
         "mu_of(settings.epsilon, settings.delta) * np.ones_like(task.shares)",
-        "release/test_sensors.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "queries have the whole budget beside the sensors' part", 14, "release/sensors.py",
         'Group("queries", 1.0 - share, penetration)', 'Group("queries", 1.0, penetration)',
-        "release/test_sensors.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "sensors have the noise of queries", 14, "release/gaussian.py",
         "self.noise_std[task.group]", "self.noise_std[0 * task.group]",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
+    ),
+    Mutant(
+        "the report of caps has the mu of one group", 14, "release/gaussian.py",
+        "math.hypot(*self.mu), task.settings.delta", "max(self.mu), task.settings.delta",
+        "test_guarantee.py",
+    ),
+    Mutant(
+        "the report of ledgers has the mu of one group", 14, "release/paced.py",
+        "EpsilonTable(math.hypot(*self.mu), settings.delta)",
+        "EpsilonTable(max(self.mu), settings.delta)",
+        "test_guarantee.py",
     ),
     # --- noise --------------------------------------------------------------------------------
     Mutant(
@@ -475,6 +527,11 @@ MUTANTS = (
         'against = "" if self.noise == "secure" else', 'against = "" if self.noise else',
         "release/test_paced.py",
     ),
+    Mutant(
+        "a model whose noise is its own says that it is secure", 18, "release/base.py",
+        'has_noise = self.settings.noise == "seeded" or', "has_noise = True or",
+        "test_streams.py",
+    ),
     # --- from distances to the guarantee ------------------------------------------------------
     Mutant(
         "the estimator reads a second before the centres are taken", 19, "process.py",
@@ -518,6 +575,14 @@ MUTANTS = (
         "release/test_fusion.py",
     ),
     Mutant(
+        "answers are divided by the true share", 20, "process.py",
+        "measured = self.fusion.read(measured, request.prediction())",
+        "self.fusion.share = self.config.penetration.share_of("
+        "self.config.traffic_seeds[request.traffic[0]]); "
+        "measured = self.fusion.read(measured, request.prediction())",
+        "test_non_interference.py",
+    ),
+    Mutant(
         "density and flow have the noise that each needs alone", 21, "privacy/gaussian.py",
         "shares = share, 1.0 - share", "shares = 1.0, 1.0",
         "privacy/test_gaussian.py",
@@ -534,14 +599,36 @@ MUTANTS = (
         "privacy/test_gaussian.py",
     ),
     Mutant(
+        "mu is a little too large", 21, "privacy/gaussian.py",
+        "return float(brentq(excess, low, high, xtol=1e-16 * low",
+        "return (1.0 + 1e-11) * float(brentq(excess, low, high, xtol=1e-16 * low",
+        "privacy/test_gaussian.py",
+    ),
+    Mutant(
+        "epsilon is given for another delta than is named", 21, "privacy/gaussian.py",
+        "{name: epsilon_of(mu, float(name)) for name in DELTAS}",
+        "{name: epsilon_of(mu, 0.05) for name in DELTAS}",
+        "release/test_gaussian.py",
+    ),
+    Mutant(
+        "a guarantee states mu rounded down", 21, "release/base.py",
+        "math.ceil(1e4 * mu)", "math.floor(1e4 * mu)",
+        "release/test_paced.py",
+    ),
+    Mutant(
+        "the reserve is smaller than the rounding of ledgers", 22, "privacy/gaussian.py",
+        "ROUNDING = 2.0**-30", "ROUNDING = 2.0**-36",
+        "privacy/test_gaussian.py",
+    ),
+    Mutant(
         "ledgers keep nothing back for rounding", 22, "release/paced.py",
         "(1.0 - ROUNDING) * self.budget", "self.budget",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "capped noise keeps nothing back for rounding", 22, "release/gaussian.py",
         "factor = (1.0 + ROUNDING) / math.sqrt", "factor = 1.0 / math.sqrt",
-        "release/test_gaussian.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "an episode may have more payments than the reserve covers", 22, "release/paced.py",
@@ -583,23 +670,34 @@ MUTANTS = (
         "what is spent leaves out queries that overlap", 24, "release/paced.py",
         "paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price",
         "paid[accounts.group[c], s] = (1.0 + accounts.ratio) * price",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "what is spent is the largest of a group", 24, "release/paced.py",
         "np.sqrt(squares.sum(axis=1))", "np.sqrt(squares.max(axis=1))",
-        "release/test_sensors.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "what is spent is the largest of a second", 24, "release/paced.py",
         "if accounts.is_event else charged[g] + largest", "",
-        "release/test_paced.py",
+        "test_guarantee.py",
     ),
     Mutant(
         "what is spent is a vehicle's payment at the predicted speed", 24, "release/paced.py",
         "paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price",
         "paid[accounts.group[c], s] += price",
-        "release/test_paced.py",
+        "test_guarantee.py",
+    ),
+    Mutant(
+        "what is spent grows with the number of contributions", 24, "privacy/gaussian.py",
+        "self.mu * np.sqrt(np.arange(n + 1) / n)", "self.mu * (np.arange(n + 1) / n)",
+        "privacy/test_gaussian.py",
+    ),
+    Mutant(
+        "what is spent is what a vehicle has truly paid", 24, "release/paced.py",
+        "return self._losses(self._charged[episodes])",
+        "return self._losses(self.ledgers.paid[episodes].max(axis=2, initial=0.0))",
+        "test_non_interference.py",
     ),
     Mutant(
         "epsilon is rounded down to a level of mu", 24, "privacy/gaussian.py",

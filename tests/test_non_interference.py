@@ -4,8 +4,8 @@ No error would show it if it did, and the proofs would be void. With a release m
 the same values whatever the traffic, two episodes over different traffic must look the same, bit by
 bit: observations, estimates and ``info``, and prices, centres and deviations, which depend on what
 was released before alone. The paper's presets feed the estimator true boundary inputs. That is
-their declared exception, so they are tested without it, and one test shows that it is one. Each way
-for the truth to slip through is kept as a mutation that the comparison must catch.
+their declared exception, so they are tested without it, and one test shows that it is one. Ways for
+the truth to slip through are mutants, in ``tests/mutants.py``.
 """
 
 import itertools
@@ -16,7 +16,6 @@ import pytest
 
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.process import TRUTH_INFO
-from dptse_env.release import Fusion, Paced, Pacing
 from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES, PROCESS_SCHEDULES, make_schedule
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from tests.helpers import fast_and_slow
@@ -189,7 +188,7 @@ def test_what_is_released_of_traffics_does_differ():
     assert unlike(make_private())
 
 
-# --- mutations that must be caught: of the process ----------------------------------------------
+# --- what must be caught -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -205,147 +204,3 @@ def test_true_boundary_inputs_would_show(preset, estimator, shows):
 @pytest.mark.parametrize("oracle", sorted(ORACLES))
 def test_an_oracle_shows(oracle):
     assert unlike(blind(make_private()), oracle)
-
-
-def leave_out_empty_segments(process):
-    update = process.estimator.update
-
-    def mutant(episodes, measured):
-        occupied = process.truth(episodes)[..., 0] > 0
-        update(episodes, measured._replace(observed=measured.observed & occupied))
-
-    process.estimator.update = mutant
-
-
-def mark_empty_segments(process):
-    measure = process.measure
-
-    def mutant(request):
-        measured = measure(request)
-        occupied = process.truth(request.episodes)[..., :1] > 0
-        return measured._replace(values=np.where(occupied, measured.values, 0.0))
-
-    process.measure = mutant
-
-
-def begin_at_the_truth(process):
-    reset = process.estimator.reset
-
-    def mutant(episodes, states, generators):
-        truth = process.truth(episodes)
-        reset(episodes, process.model.states(truth[..., 0] + 1.0, truth[..., 1]), generators)
-
-    process.estimator.reset = mutant
-
-
-def tell_realised_exposures(process):
-    """An account of what vehicles really spent is no public number."""
-    info = process.info
-
-    def mutant(episode):
-        paid = process.release.ledgers.paid[episode]
-        return info(episode) | {"spent_mu": float(paid.max(initial=0))}
-
-    process.info = mutant
-
-
-@pytest.mark.parametrize(
-    "mutation",
-    [leave_out_empty_segments, mark_empty_segments, begin_at_the_truth, tell_realised_exposures],
-)
-def test_a_process_that_looks_at_the_truth_would_show(mutation):
-    env = blind(make_private())
-    mutation(env.unwrapped.process)
-    assert unlike(env)
-
-
-def test_a_share_that_only_the_truth_shows_would_be_noticed(monkeypatch):
-    env = blind(make_private("paced", **PARTLY))
-    process, read = env.unwrapped.process, Fusion.read
-
-    def knowing(self, measured, prediction):
-        share = process.config.penetration.share_of(SEEDS[process.traffic_index[0]])
-        return read(self, measured._replace(values=measured.values / share), prediction)
-
-    monkeypatch.setattr(Fusion, "read", knowing)
-    assert unlike(env)
-
-
-# --- mutations that must be caught: of the paced ledger -----------------------------------------
-
-
-class Looking(Paced):
-    """Changes the prediction that prices and centres are taken from, by the truth."""
-
-    def release(self, request):
-        density, speed = np.moveaxis(self.traffic.aggregates(request.traffic, request.times), -1, 0)
-        seen = request.prediction()._replace(**self.look(request, density, speed))
-        return super().release(request._replace(prediction=lambda: seen))
-
-
-class CentreOfTheTruth(Looking):
-    def look(self, request, density, speed):
-        return {"speed": speed}
-
-
-class PriceOfTrueCounts(Looking):
-    def look(self, request, density, speed):
-        return {"density": density}
-
-
-class FallsBackWhereNobodyIs(Looking):
-    """Takes a segment that is empty for one without a prediction."""
-
-    def look(self, request, density, speed):
-        return {"speed": np.where(density == 0.0, np.nan, request.prediction().speed)}
-
-
-class CentreOfTheSameSecond(Looking):
-    """Centred on speeds that this second's own noisy sums have corrected."""
-
-    def look(self, request, density, speed):
-        predicted = request.prediction().speed
-        n = predicted.shape[1]
-        values = Paced.release(self, request).values[:, :n]
-        told = predicted + values[..., 1] / np.maximum(values[..., 0], 10.0)
-        return {"speed": np.where(request.observed[:, :n], told, predicted)}
-
-
-class PriceOfTrueLedgers(Paced):
-    """Prices by what the vehicles have really left."""
-
-    def __init__(self, task, traffic):
-        super().__init__(task, traffic)
-        ledgers = self.ledgers
-
-        class FromLedgers(Pacing):
-            def prices(self, episodes, observed, density, speed):
-                left = ledgers.budget - ledgers.paid[episodes].max(axis=2, initial=0.0)
-                return np.broadcast_to(np.maximum(0.05 * left, 1e-3), observed.shape).copy()
-
-        self.pacing = FromLedgers(task, self.pacing.budget)
-
-
-class AccountOfTrueLedgers(Paced):
-    def spent(self, episodes, steps):
-        most = self.ledgers.paid[episodes, 0].max(axis=1, initial=0.0)
-        return np.sqrt(2.0 * most), np.sqrt(2.0 * most)
-
-
-class RefusalsInPublic(Paced):
-    def public(self, episodes):
-        refused = self.private(episodes, np.zeros_like(episodes))["n_refused"]
-        return super().public(episodes) | {"n_refused": refused}
-
-
-@pytest.mark.parametrize(
-    "kind",
-    [
-        CentreOfTheTruth, PriceOfTrueCounts, FallsBackWhereNobodyIs, CentreOfTheSameSecond,
-        PriceOfTrueLedgers, AccountOfTrueLedgers, RefusalsInPublic,
-    ],
-)  # fmt: skip
-def test_a_ledger_that_looks_at_the_truth_would_show(kind):
-    """Little privacy is left, so that some vehicles run out within the episode."""
-    little = {"preset": kind, "epsilon": 0.5, "pace": 1.0}
-    assert unlike(blind(make_private("paced", privacy=little)))

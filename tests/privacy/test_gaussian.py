@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from dptse_env.privacy import (
     DELTAS,
+    ROUNDING,
     EpsilonTable,
     ReleaseAccount,
     contribution_sensitivity,
@@ -23,6 +24,7 @@ from dptse_env.privacy import (
     over_trips,
     paper_sensitivity,
     printed_noise_std,
+    require_covered,
     single_noise_std,
 )
 
@@ -106,6 +108,14 @@ def test_mu_is_exact_to_twice_ten_to_the_minus_twelve_wherever_a_guarantee_may_b
         assert abs(excess / slope / mu) < 2e-12
     # That of dp-accounting has an error of its own, where epsilon is small.
     assert 1.0 / mu == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-10)
+
+
+def test_no_more_payments_are_allowed_than_the_reserve_covers():
+    """Each is off by 2^-53 of the budget, deviations of the noise by 2^-49, mu by 2e-12."""
+    too_many = (ROUNDING - 2.0**-49 - 2.0 * 2e-12) * 2.0**53
+    require_covered(2**22)
+    with pytest.raises(ValueError, match=r"^horizon must be shorter: .* 4194304 times"):
+        require_covered(int(too_many))
 
 
 @settings(deadline=None)

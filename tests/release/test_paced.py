@@ -2,8 +2,8 @@
 
 No two trips are told apart by more than mu under ledgers, whatever is public. That holds surely and
 is tested without noise: for any queries, prices and centres, two records that differ in one vehicle
-have sums that are never further apart than mu, in units of the noise. Each way of getting it wrong
-is kept as a mutant that breaks the bound; those that look where they must not are in
+have sums that are never further apart than mu, in units of the noise. Ways of getting it wrong are
+mutants (``tests/mutants.py``); those that look where they must not are in
 ``tests/test_non_interference.py``.
 """
 
@@ -30,7 +30,6 @@ from .worlds import (
     SEGMENTS,
     TWO_GROUPS,
     WHOLE,
-    PlainLedgers,
     Public,
     T,
     Worlds,
@@ -390,73 +389,6 @@ def test_made_up_trips_reach_the_whole_of_mu(first, second, wish, options):
     asked, worlds = PacedSettings(clip=LIMIT / 2, **wish), Worlds(first, second)
     price = exhausting(worlds, asked, **options)
     assert 0.999 < reached(worlds, asked, price, **options) <= 1.0
-
-
-# --- mutants -------------------------------------------------------------------------------------
-
-REPLACE, ADD = (PacedSettings(clip=25.0, adjacency=which) for which in ("replace", "add_remove"))
-
-
-def queue(first):
-    """Vehicle 0, if there, stands on segment 1 for the first half; vehicle 1 for the second."""
-    early = np.arange(T + 1) <= T // 2
-    places = np.where([early & first, ~early], 1, AWAY)
-    places[:, 0] = AWAY
-    return record(places, np.zeros((2, T + 1)))
-
-
-MOVES, SENSED = drives(np.arange(T) % 4, 0.0), drives(np.repeat([2, 1], T // 2), 0.0)
-PAID = PlainLedgers.cost
-CLIPPED = PlainLedgers.told
-MUTANTS = {
-    "a ledger for each segment": (
-        {"account": lambda _, vehicle, place, column: (vehicle, place)},
-        ADD, {}, MOVES, NOBODY, 3.9,
-    ),
-    "a ledger for each query": (
-        {"account": lambda _, vehicle, place, column: (vehicle, column)},
-        ADD, OVERLAPPING, MOVES, NOBODY, 2.5,
-    ),
-    "a ledger that vehicles share": (
-        {"account": lambda _, vehicle, place, column: place},
-        ADD, {}, queue(True), queue(False), 1.9,
-    ),
-    "sensors that are not charged": (
-        {"cost": lambda own, price, raw, column, nth: PAID(own, price, raw, column, nth)
-         * (column != 2)},
-        ADD, {}, SENSED, NOBODY, 1.9,
-    ),
-    "overlaps charged once": (
-        {"cost": lambda own, price, raw, column, nth: PAID(own, price, raw, column, nth)
-         * (nth == 0)},
-        ADD, OVERLAPPING, STANDS, NOBODY, 4.9,
-    ),
-    "released at the unclipped deviation": (
-        {"told": lambda _, raw: raw,
-         "cost": lambda own, price, raw, column, nth: price
-         * (1.0 + own.ratio * (CLIPPED(own, raw) / own.clip) ** 2)},
-        ADD, {}, STANDS, NOBODY, 2.5,
-    ),
-    "charged for the count alone": (
-        {"cost": lambda _, price, raw, column, nth: price}, ADD, {}, STANDS, NOBODY, 1.9,
-    ),
-    "the budget of add_remove under replace": (
-        {"cost": lambda own, price, raw, column, nth: 0.5 * PAID(own, price, raw, column, nth)},
-        REPLACE, {}, STANDS, stays(3, 0.0), 1.9,
-    ),
-}  # fmt: skip
-"""Mistakes of ledgers, worlds that show them, and the part of mu^2 that they reach at least."""
-
-
-@pytest.mark.parametrize(
-    ("wrong", "asked", "options", "first", "second", "least"), MUTANTS.values(), ids=MUTANTS
-)
-def test_wrong_ledgers_exceed_mu(wrong, asked, options, first, second, least):
-    """At a price that uses a correct ledger up in a second."""
-    worlds, kind = Worlds(first, second), type("Wrong", (PlainLedgers,), wrong)
-    price = exhausting(worlds, asked, within=1, **options)
-    assert reached(worlds, asked, price, ledgers=kind, **options) > least
-    assert 0.7 < reached(worlds, asked, price, ledgers=PlainLedgers, **options) <= 1.0
 
 
 def test_a_ratio_above_one_exceeds_mu_under_replace():

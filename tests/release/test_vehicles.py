@@ -97,7 +97,7 @@ def test_ledgers_count_as_they_do_when_written_out(spans, groups, ratio):
     worlds = Worlds(*(crowd(30, seed) for seed in range(3)))
     given = {"groups": groups, "spans": spans, "bandwidth": 6}
     made, plain = (
-        worlds.started(PacedSettings(ratio=ratio, clip=25.0), ledgers=kind, **given)
+        worlds.started(PacedSettings(ratio=ratio, clip=25.3), ledgers=kind, **given)
         for kind in (None, PlainLedgers)
     )
     budget, generator, shape = made.budget, np.random.default_rng(0), (T, made.task.n_columns)

@@ -201,30 +201,7 @@ def squared_distance(release, public):
 
 
 class PlainLedgers(Ledgers):
-    """Ledgers written out in Python; subclasses get one thing wrong on purpose."""
-
-    def account(self, vehicle, place, column):
-        """The account of a group that pays."""
-        return vehicle
-
-    def cost(self, price, raw, column, nth):
-        """The charge for a deviation before it is clipped, to the nth query of a segment."""
-        d = self.told(raw)
-        return price * (1.0 + self.ratio * d * d / (self.clip * self.clip))
-
-    def told(self, raw):
-        """The deviation that is released, a multiple of the grid."""
-        most = np.floor(self.clip / self.grid)
-        return min(max(np.rint(raw / self.grid), -most), most) * self.grid
-
-    def __init__(self, *args, **keywords):
-        super().__init__(*args, **keywords)
-        self.accounts = {}
-
-    def reset(self, episodes, n_vehicles=None):
-        super().reset(episodes, n_vehicles)
-        gone = set(episodes.tolist())
-        self.accounts = {key: paid for key, paid in self.accounts.items() if key[0] not in gone}
+    """Ledgers written out in Python."""
 
     def collect(self, episodes, observed, rows, prices, centre, sigma):
         first, span, group = self._columns
@@ -236,20 +213,18 @@ class PlainLedgers(Ledgers):
                 if place >= centre.shape[1]:
                     continue
                 covers = observed[k] & (first <= place) & (place < first + span)
-                for nth, column in enumerate(np.flatnonzero(covers).tolist()):
+                for column in np.flatnonzero(covers).tolist():
                     g = int(group[column])
                     if rows.speed[g, row] < 0.0:
                         continue
                     raw = float(min(rows.speed[g, row], self.fastest)) - centre[k, place]
-                    self.grid = grid_of(float(sigma[k, column, 1]))
-                    key = episode, g, self.account(vehicle, place, column)
-                    paid = self.accounts.get(key, 0.0)
-                    cost = self.cost(prices[k, column], raw, column, nth)
-                    if paid + cost <= self.budget[g]:
-                        self.accounts[key] = paid + cost
-                        if vehicle < self.paid.shape[2]:
-                            self.paid[episode, g, vehicle] += cost
-                        sums[k, column] += 1.0, self.told(raw)
+                    grid = grid_of(float(sigma[k, column, 1]))
+                    most = np.floor(self.clip / grid)
+                    d = min(max(np.rint(raw / grid), -most), most) * grid
+                    cost = prices[k, column] * (1.0 + self.ratio * d * d / (self.clip * self.clip))
+                    if self.paid[episode, g, vehicle] + cost <= self.budget[g]:
+                        self.paid[episode, g, vehicle] += cost
+                        sums[k, column] += 1.0, d
                     else:
                         refused[k, g] += 1
         return sums, refused
