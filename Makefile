@@ -37,7 +37,7 @@ reproduce: setup  ## Write the reports of all studies anew, after playing what t
 	$(BIN)/dptse study policies
 	$(BIN)/dptse study suite
 
-audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; results/audit.
+audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds or one run; results/audit.
 	$(BIN)/dptse audit --force --env dptse_env:dptse/PaperHighway-v0 --target replaced
 	$(BIN)/dptse audit --force --env 'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected"}' --target replaced
 	$(BIN)/dptse audit --force --env 'dptse_env:dptse/PrivateHighway-v1 {"privacy": "capped"}' --noise-factor 0.709
@@ -46,6 +46,10 @@ audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds; r
 	$(BIN)/dptse audit --force
 	$(BIN)/dptse audit --force --target replaced
 	$(BIN)/dptse audit --force --target opposite
+	$(BIN)/dptse audit --force --target climbed
+	$(BIN)/dptse audit --force --env dptse_env:dptse/PaperHighway-v0 --one-run
+	$(BIN)/dptse audit --force --one-run --noise-factor 0.5
+	$(BIN)/dptse audit --force --one-run
 
 test: setup  ## Run the tests, without the slow ones.
 	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agents.audit.planner import Planner
-from agents.audit.report import audit_environment, audit_one_run
+from agents.audit.report import audit_environment, audit_one_run, check_target
 from agents.environments import make_config, parse_env
 from agents.files import refuse_to_replace
 from agents.play import Cell
@@ -29,11 +28,14 @@ class Args(Environment, Machines):
     env: str = "dptse_env:dptse/PrivateHighway-v1"
     """Environment: an id, or an id and keywords as JSON, 'ID {"privacy": {"cap": 16}}'."""
     target: str = "worst-case"
-    """Vehicle that differs: worst-case, opposite, replaced, deleted, runs-out, jam or late."""
+    """Vehicle that differs: worst-case, opposite, replaced, deleted, runs-out, jam or late; or
+    climbed, the worst one that a search from random trips and queries finds."""
     policy: str = "hunter"
     """Queries: hunter, adaptive, or a public schedule (paper, static, round-robin)."""
     runs: int = 5000
     """Runs in each of the two worlds."""
+    rounds: int = 100
+    """Rounds of the search for the target climbed."""
     one_run: bool = False
     """One episode with many vehicles that differ; target, policy and runs are its own."""
     noise_factor: float = 1.0
@@ -56,6 +58,7 @@ def main(args: Args) -> None:
     """Attack, and leave table and file."""
     # Everything is checked before anything is recorded.
     integer("runs", args.runs, 2)
+    integer("rounds", args.rounds, 0)
     integer("traffic_seed", args.traffic_seed, 0)
     integer("seed", args.seed, 0)
     positive("noise_factor", args.noise_factor)
@@ -67,7 +70,7 @@ def main(args: Args) -> None:
         for name in ("target", "policy", "runs"):
             given = getattr(args, name)
             require(given == getattr(Args, name), name, "left out with --one-run", given)
-    Planner(config, args.policy).require_kind(args.target)
+    check_target(config, args.target, args.policy)
     preset = re.sub(r"\W+", "-", privacy_report(config).preset)
     noise = "" if args.noise_factor == 1.0 else f"-noise-{args.noise_factor:g}"
     attack = "one-run" if args.one_run else f"{args.target}-{args.policy}"
@@ -83,7 +86,7 @@ def main(args: Args) -> None:
     if args.one_run:
         finding = audit_one_run(config, record, **options)
     else:
-        options |= {"n_runs": args.runs, "executor": executor}
+        options |= {"n_runs": args.runs, "rounds": args.rounds, "executor": executor}
         finding = audit_environment(config, record, args.target, args.policy, **options)
     finding = dataclasses.replace(finding, title=f"{env.rpartition('/')[2]}, {finding.title}")
     finding.write(path, dataclasses.asdict(args))

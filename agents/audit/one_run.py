@@ -24,7 +24,6 @@ from dptse_env.parts import make_task
 from dptse_env.release import Task
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import require
 
 KINDS = {
     "elsewhere": "stands on one segment, or on another",
@@ -113,14 +112,11 @@ def make_design(config: EnvConfig, slot: int, kind: str) -> Design:
     Args:
         config: The configuration under attack.
         slot: Length of a slot.
-        kind: What a coin decides, one of `KINDS`.
-
-    Raises:
-        ValueError: There are not enough query options that share no segment.
+        kind: What a coin decides, one of `KINDS`; ``elsewhere`` takes two options that share no
+            segment.
     """
     task, size = make_task(config), 2 if kind == "elsewhere" else 1
-    queries, sites = task.queries, _sites(task)
-    require(len(sites) >= size, "query_spans", "such that two queries are apart", queries)
+    queries, sites = task.queries, apart(task)
     sites = sites[: len(sites) // size * size]
     at_once = int(np.count_nonzero(np.cumsum(queries.cost[sites]) <= queries.bandwidth))
     # Where only one query can be paid for, the two options of a pair take turns.
@@ -151,10 +147,10 @@ def make_design(config: EnvConfig, slot: int, kind: str) -> Design:
     return Design(kind, slot, canaries, plan, owner)
 
 
-def _sites(task: Task) -> IntArray:
-    """Return query options that share no segment, the cheapest of each segment."""
+def apart(task: Task) -> IntArray:
+    """Return query options that share no segment; the cheapest come first, and the least noise."""
     taken, sites = np.zeros(task.n_places, dtype=bool), []
-    for option in np.argsort(task.queries.cost, kind="stable").tolist():
+    for option in np.lexsort((-task.queries.level, task.queries.cost)).tolist():
         covered = task.covers[option]
         if not (covered & taken).any():
             taken |= covered
@@ -177,8 +173,7 @@ def attack_in_one_run(
         seed: Seeds coins and noise, >= 0.
 
     Raises:
-        ValueError: There are not enough query options that share no segment, or the adversary does
-            not know the distribution of the noise.
+        ValueError: The adversary does not know the distribution of the noise.
     """
     rehearsal, run = np.random.default_rng(seed).spawn(2)
     tried = [
@@ -197,7 +192,9 @@ def _designs(config: EnvConfig) -> list[list[Design]]:
     longest = 1 if planner.is_event else config.horizon_steps
     n = int(np.log(longest) / np.log(RATIO)) + 1
     slots = np.unique(np.rint(RATIO ** np.arange(n)).astype(int)).tolist()
-    kinds = ("elsewhere", "fast") if planner.replaces else ("absent",)
+    kinds = ["fast"] if planner.replaces else ["absent"]
+    if planner.replaces and len(apart(make_task(config))) > 1:
+        kinds.append("elsewhere")
     designs = [[make_design(config, slot, kind) for slot in slots] for kind in kinds]
     return [[each for each in row if each.n >= FEWEST] or row[:1] for row in designs]
 

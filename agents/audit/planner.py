@@ -98,17 +98,12 @@ class Planner:
 
     # Targets ------------------------------------------------------------------------------------
 
-    def require_kind(self, kind: str) -> None:
-        """Refuse kinds of targets that the environment does not have.
-
-        Raises:
-            ValueError: It is none of `KINDS`, or does not go with the adjacency or with two groups
-                of columns.
-        """
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Those of `KINDS` that go with the adjacency and the groups of columns."""
         kinds = KINDS if self._is_whole else ("worst-case",)
-        if not self.replaces:
-            kinds = tuple(each for each in kinds if each not in ("opposite", "replaced"))
-        require(kind in kinds, "target", f"one of {list(kinds)} here", kind)
+        alone = () if self.replaces else ("opposite", "replaced")
+        return tuple(kind for kind in kinds if kind not in alone)
 
     def choose(self, record: Record, kind: str) -> AdjacentWorlds:
         """Return the two worlds of a kind that the policy distinguishes best.
@@ -125,9 +120,9 @@ class Planner:
                 one that tells most of those that enter in the second half.
 
         Raises:
-            ValueError: See `require_kind`; or the record holds too few vehicles.
+            ValueError: It is none of `kinds`, or the record holds too few vehicles.
         """
-        self.require_kind(kind)
+        require(kind in self.kinds, "target", f"one of {list(self.kinds)} here", kind)
         is_made_up = kind in ("worst-case", "opposite")
         worlds = self._made_up(record, kind) if is_made_up else self._of_record(record, kind)
         return max(worlds, key=self._reached) if len(worlds) > 1 else worlds[0]

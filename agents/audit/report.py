@@ -14,6 +14,7 @@ from typing import Any
 from agents.audit.attack import attack
 from agents.audit.one_run import KINDS, attack_in_one_run
 from agents.audit.planner import Planner
+from agents.audit.search import CLIMBED, climb
 from agents.audit.statistics import (
     AuditResult,
     Claim,
@@ -30,6 +31,7 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import PrivacyReport
 from dptse_env.traffic import Record
+from dptse_env.utils.fields import require
 
 VIOLATION = math.sqrt(2.0)
 """Ratio of a true mu to the claimed one for which power is reported: noise divided by 1.41."""
@@ -95,7 +97,8 @@ class Finding:
             trials = f"by the expected errors at {result.n} canaries of one run"
         print_text(
             f"worlds: {self.target}; queries: {self.policy}; noise x {self.noise_factor:g}\n"
-            f"distance: {self.distance:.3f} sigma {trials} ({self.seconds:.0f} s)\n"
+            f"distance: {self.distance:.3f} sigma {trials} ({self.seconds:.0f} s); "
+            f"{self.distance / claim.mu:.4f} of the claim\n"
             f"epsilon of a Gaussian release with the bound on mu: {self.gaussian_epsilon:.3f}\n"
             f"power against a mu of {VIOLATION:.2f} times the claim: {self.power:.4f}"
         )
@@ -108,6 +111,8 @@ class Finding:
         else:
             few = "canaries" if result.is_one_run else "runs"
             print_text(f"too few {few} to reject this claim, however much leaks")
+        if result.mu_of_any is not None:
+            print_text(f"without independence of the noise: a mu of {result.mu_of_any:.3f} or more")
         if "boundary_inputs" in self.privacy.void_reasons:
             print_text(
                 "the estimates see the true traffic at the boundary, which makes their epsilon "
@@ -142,6 +147,7 @@ def audit_environment(
     policy: str = "hunter",
     *,
     n_runs: int = 5000,
+    rounds: int = 100,
     noise_factor: float = 1.0,
     confidence: float = 0.95,
     seed: int = 0,
@@ -152,9 +158,12 @@ def audit_environment(
     Args:
         config: The configuration under attack, of `agents.environments.make_config`.
         record: The traffic, whose vehicles are known.
-        target: Kind of the vehicle that differs, in `agents.audit.planner.KINDS`.
-        policy: Queries, in `agents.audit.planner.POLICIES`.
+        target: Kind of the vehicle that differs, in `agents.audit.planner.KINDS`, or ``climbed``,
+            the worst one that a search from random trips and queries finds.
+        policy: Queries, in `agents.audit.planner.POLICIES`; what is searched for takes the place of
+            a hunter's.
         n_runs: Runs in each of the two worlds, >= 2.
+        rounds: Rounds of the search.
         noise_factor: Multiplies the real noise, not the declared one.
         confidence: Confidence of the lower bounds.
         seed: Seeds the noise, >= 0.
@@ -165,13 +174,19 @@ def audit_environment(
             few vehicles, or the release model does not add its noise by a
             `dptse_env.release.noise.Noise`.
     """
-    planner, report = Planner(config, policy), privacy_report(config)
-    worlds = planner.choose(record, target)
-    start = time.perf_counter()
+    check_target(config, target, policy)
+    report, start = privacy_report(config), time.perf_counter()
+    if target == CLIMBED:
+        options: dict[str, Any] = {"policy": policy, "seed": seed, "executor": executor}
+        worlds, queries = climb(config, record, rounds, **options)
+    else:
+        planner = Planner(config, policy)
+        worlds = planner.choose(record, target)
+        queries = planner.queries(worlds)
     runs = attack(
         config,
         worlds,
-        planner.queries(worlds),
+        queries,
         n_runs,
         noise_factor=noise_factor,
         seed=seed,
@@ -211,8 +226,8 @@ def audit_one_run(
         seed: Seeds coins and noise, >= 0.
 
     Raises:
-        ValueError: No query leaves another segment to query, or the release model does not add its
-            noise by a `dptse_env.release.noise.Noise`.
+        ValueError: The release model does not add its noise by a
+            `dptse_env.release.noise.Noise`.
     """
     report, start = privacy_report(config), time.perf_counter()
     run = attack_in_one_run(config, record, noise_factor=noise_factor, seed=seed)
@@ -226,6 +241,16 @@ def audit_one_run(
         privacy=report,
         seconds=time.perf_counter() - start,
     )
+
+
+def check_target(config: EnvConfig, target: str, policy: str) -> None:
+    """Refuse a target or a policy that there is not.
+
+    Raises:
+        ValueError: See above.
+    """
+    targets = [*Planner(config, policy).kinds, CLIMBED]
+    require(target in targets, "target", f"one of {targets} here", target)
 
 
 def claim_of(report: PrivacyReport) -> Claim:

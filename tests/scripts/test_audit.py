@@ -92,6 +92,13 @@ def test_one_run_says_the_same(privacy, factor, verdict, tmp_path, capsys):
     assert f"{found['result']['n']} canaries" in capsys.readouterr().out
 
 
+def test_the_worst_pair_is_searched_for_and_attacked(tmp_path):
+    name, found = run(tmp_path, target="climbed", rounds=0, runs=20, noise_factor=0.5)
+    assert name == "capped-climbed-hunter-noise-0.5.json"
+    assert "climbed in 0 rounds" in found["target"]
+    assert 1.5 * mu_of(5.0, 0.05) < found["distance"] <= 2.0 * mu_of(5.0, 0.05) * (1.0 + 1e-9)
+
+
 def test_every_argument_arrives(tmp_path):
     privacy = {**CAPPED, "delta": 0.01, "adjacency": "add_remove"}
     arguments = {"runs": 10, "target": "deleted", "policy": "adaptive", "confidence": 0.9}
@@ -115,6 +122,7 @@ def test_every_argument_arrives(tmp_path):
     [
         ({"target": "everyone"}, "target"),
         ({"policy": "random"}, "policy"),
+        ({"rounds": -1}, "rounds"),
         ({"runs": 1}, "runs"),
         ({"noise_factor": 0.0}, "noise_factor"),
         ({"confidence": 1.0}, "confidence"),
