@@ -334,15 +334,18 @@ def distances(config, records, wanted, seed):
     """Play episodes of either world, and of a common record; return the squares over mu^2."""
     heard, found = Eavesdropper(config, records), []
     process = heard.process
-    told, claimed = process.privacy()["mu"], mu_of(config.privacy.epsilon, config.privacy.delta)
-    mu = min(Fraction(told), Fraction(claimed))
+    account, claimed = process.privacy(), mu_of(config.privacy.epsilon, config.privacy.delta)
+    mu = min(Fraction(account["mu"]), Fraction(claimed))
+    if getattr(config.penetration, "worlds", None) == (False, False):  # sensors alone see it
+        mu = min(mu, Fraction(account["groups"][-1]["mu"]))
     for world, traffic in ((0, [0, 1, 2, 3]), (1, [COMMON] * 4), (1, [0, 1, 2, 3])):
         heard.begin(world, traffic, seed)
+        assert process.info(0)["spent_mu"] == 0.0
         for _ in range(HORIZON):
             process.step(ONE, wanted[process.time + 1])
             spent = process.info(0)["spent_mu"]
             assert heard.square <= min(Fraction(spent), mu) ** 2
-            assert spent <= told
+            assert spent <= account["mu"]
         found.append(heard.square / mu**2)
     assert found[1] == 0
     return found

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.audit.attack import attacked_form, make_overheard
+from agents.audit.attack import Queries, overheard
 from agents.audit.planner import public_plan
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from agents.environments import make_config
@@ -54,12 +54,11 @@ def play(config: EnvConfig, worlds: AdjacentWorlds) -> Transcript:
         {t: (s, v) for t, s, v in zip(trip.step, trip.segment, trip.speed, strict=True)}
         for trip in worlds.trajectories
     ]
-    process, release = make_overheard(config, worlds, 1)
-    process.reset(np.array([0]), [np.random.default_rng(0)], {"traffic_seed": 0, "start": 0})
-    length, paid = release.task.length, np.zeros(2)
-    for t, queried in enumerate(public_plan(config, "round-robin")):
-        process.step(np.array([0]), queried[None].astype(np.int8))
+    queries, paid = Queries(public_plan(config, "round-robin")), np.zeros(2)
+    world_0, streams = np.zeros(1, dtype=np.int64), [np.random.default_rng(0)]
+    for t, release in enumerate(overheard(config, worlds, world_0, queries, streams)):
         observed, values, sigma, centre = (part[0] for part in release.last)
+        length = release.task.length
         for world, trip in enumerate(trips):
             segment, speed = trip.get(t + 1, (0, np.nan))
             for c in np.flatnonzero(observed & (release.task.first == segment)):
@@ -136,7 +135,7 @@ def say(axis: Axes, at: tuple[float, float], text: str, colour: str) -> None:
 
 def main() -> None:
     """Draw the picture."""
-    config = attacked_form(make_config("dptse_env:dptse/PrivateHighway-v1", {}))
+    config = make_config("dptse_env:dptse/PrivateHighway-v1", {})
     record = RecordLibrary().get(config.corridor, 0)
     trips = tuple(Trajectory.from_record(record, vehicle) for vehicle in VEHICLES)
     rest = record.without(VEHICLES[1]).without(VEHICLES[0])

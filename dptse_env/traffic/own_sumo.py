@@ -52,6 +52,7 @@ TOLERANCE = 0.01
 KMH = 3.6
 """Factor from m/s to km/h."""
 
+_PATH = "corridor.network"
 _WRITTEN = ("file", "output", "dest")
 
 
@@ -94,18 +95,16 @@ class SumoScenario:
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
-        checked_fields(self, "corridor.network")
+        checked_fields(self, _PATH)
         n_files, n_sums = len(self.files), len(self.sha256)
-        require(
-            n_sums == n_files, "corridor.network.sha256", f"one for each of {n_files} files", n_sums
-        )
+        require(n_sums == n_files, f"{_PATH}.sha256", f"one for each of {n_files} files", n_sums)
         allowed = f"at most begin = {self.begin} s"
-        require(self.warm_up <= self.begin, "corridor.network.warm_up", allowed, self.warm_up)
+        require(self.warm_up <= self.begin, f"{_PATH}.warm_up", allowed, self.warm_up)
         steps = 1.0 / self.step_length
         allowed = "a whole part of a second"
         require(
             abs(steps - round(steps)) < 1e-9,
-            "corridor.network.step_length",
+            f"{_PATH}.step_length",
             allowed,
             self.step_length,
         )
@@ -115,12 +114,12 @@ class SumoScenario:
     def _check_options(self) -> None:
         for option in self.options:
             match = re.fullmatch(r"--([a-z][\w.-]*)(=.*)?", option)
-            require(match is not None, "corridor.network.options", "--name=value each", option)
+            require(match is not None, f"{_PATH}.options", "--name=value each", option)
             assert match is not None
             free = match[1] not in FORCED and not WRITES.search(match[1])
             require(
                 free,
-                "corridor.network.options",
+                f"{_PATH}.options",
                 "free of outputs and of what a recording sets",
                 option,
             )
@@ -128,7 +127,7 @@ class SumoScenario:
     def _check_columns(self) -> None:
         taken: dict[str, list[tuple[float, float]]] = {}
         for i, stretches in enumerate(self.columns):
-            path = f"corridor.network.columns[{i}]"
+            path = f"{_PATH}.columns[{i}]"
             require(bool(stretches), path, "at least one stretch of an edge", stretches)
             for edge, start, end in stretches:
                 require(start < end, path, "stretches that end after they start", (start, end))
