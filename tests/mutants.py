@@ -28,7 +28,9 @@ SPARED = (".*", "__pycache__", "build", "dist", "results")
 MOST_SECONDS = 600.0
 """Time for the tests of a mutant, which may compile a kernel."""
 
-UNSOUND = re.compile(r"(numba\.|Attribute|Index|Key|Name|Type|UnboundLocal)")
+UNSOUND = re.compile(
+    r"numba\.|(Attribute|Index|Key|Name|Type|UnboundLocal)Error|ValueError: .*broadcast"
+)
 """How tests fail where a mutant is no sound Python, which shows nothing."""
 
 
@@ -768,10 +770,10 @@ def main(words: list[str]) -> int:
         print("| mutant | line of the proof | killed by | seconds |\n| :-- | :-- | :-- | --: |")
         for mutant in mutants:
             file, start = copy / mutant.file, time.monotonic()
-            before = file.read_text(encoding="utf-8")
-            file.write_text(mutant.applied(before), encoding="utf-8")
+            kept = shutil.copy2(file, Path(folder, "kept"))
+            file.write_text(mutant.applied(file.read_text(encoding="utf-8")), encoding="utf-8")
             killer = failed(copy, mutant.tests.split(), **environment)
-            shutil.copy2(ROOT / mutant.file, file)
+            shutil.copy2(kept, file)
             n_lived += not killer
             seconds = time.monotonic() - start
             print(
