@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import json
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -15,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from dptse_env.config import EnvConfig
 from dptse_env.env import SensorQueryEnv
 from dptse_env.evaluation import require_in_step
+from dptse_env.utils.fields import parse_json, require, shown
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 OTHER_DRIVERS: dict[str, Any] = {
@@ -54,15 +54,13 @@ def parse_env(text: str) -> tuple[str, dict[str, Any]]:
             importlib.import_module(module)
         spec = gym.spec(name)
     except (gym.error.Error, ModuleNotFoundError) as problem:
-        raise ValueError(f"env must be the id of an environment, got {env!r}: {problem}") from None
+        raise ValueError(
+            f"env must be the id of an environment, got {shown(env)}: {problem}"
+        ) from None
     if "preset" not in spec.kwargs:
-        raise ValueError(f"env must be the id of an environment of dptse_env, got {env!r}")
-    try:
-        keywords = json.loads(rest or "{}")
-    except json.JSONDecodeError as problem:
-        raise ValueError(f"env must be an id and a JSON object, got {rest!r}: {problem}") from None
-    if not isinstance(keywords, dict):
-        raise ValueError(f"env must be an id and a JSON object, got {rest!r}")
+        raise ValueError(f"env must be the id of an environment of dptse_env, got {shown(env)}")
+    keywords = parse_json(rest or "{}", "env")
+    require(isinstance(keywords, dict), "env", "an id and a JSON object", rest)
     return env, keywords
 
 

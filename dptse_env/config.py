@@ -54,6 +54,7 @@ from dptse_env.utils.fields import (
     require_name,
     shown,
 )
+from dptse_env.utils.registry import OR_IMPORTED
 
 TRAINING_SEEDS = range(1_000)
 """Traffic seeds meant for training and calibration."""
@@ -337,7 +338,8 @@ def _of_file(
     places = [(path, "environment.") for key in own for path in (key, _SHORTCUTS.get(key, key))]
     for path, table in (*places, ("corridor", "")):
         if str(problem).startswith(cut(path)):
-            return type(problem)(f"{overrides['corridor']}: {table}{problem}")
+            said = str(problem).replace(OR_IMPORTED, "")
+            return type(problem)(f"{overrides['corridor']}: {table}{said}")
     return problem
 
 

@@ -23,7 +23,7 @@ from agents.filters.training import WEIGHTS, FilterTraining
 from agents.training.run_files import check_plan
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import read_network
-from dptse_env.utils.fields import from_mapping, integer
+from dptse_env.utils.fields import from_mapping, integer, parse_json
 from scripts.cli import Machines
 from scripts.training_bar import Bar, watched
 
@@ -88,11 +88,7 @@ def make_plan(args: Args) -> FilterPlan:
         initial=args.initial,
         episodes=min(FilterPlan.episodes, len(traffic)),
     )
-    try:
-        further = json.loads(args.plan)
-    except json.JSONDecodeError as problem:
-        raise ValueError(f"plan must be a JSON object, got {args.plan!r}: {problem}") from None
-    return from_mapping(FilterPlan, further, "plan", plan)
+    return from_mapping(FilterPlan, parse_json(args.plan, "plan"), "plan", plan)
 
 
 def main(args: Args) -> None:

@@ -129,8 +129,9 @@ def test_traffic_noise_estimator_and_detectors_have_streams_of_their_own(monkeyp
     assert entropies[0] != entropies[1]
 
 
-def test_secure_noise_takes_no_seed_and_has_no_forks():
-    privacy = {"preset": "paced", "noise": "secure"}
+@pytest.mark.parametrize("preset", ["paced", "capped"])
+def test_secure_noise_takes_no_seed_and_has_no_forks(preset):
+    privacy = {"preset": preset, "noise": "secure"}
     played = [noise(begin((1, 2), EVERYWHERE, privacy=privacy)) for _ in range(2)]
     assert (played[0] != played[1]).mean() > 0.99
     process = begin((1, 2), EVERYWHERE, privacy=privacy)

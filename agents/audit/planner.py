@@ -37,6 +37,9 @@ SHORTLIST = 12
 """Partners to try for the best vehicle. The best partners stand in one jam and are alike, so the
 list grows sparser down the ranking instead of ending early."""
 
+REHEARSALS = 4
+"""Runs in either world by which pairs are compared: under `paced` noise moves prices."""
+
 Pair = tuple[Trajectory, Trajectory]
 Second = tuple[float, int, int, int]  # a cost, a step, a segment and the world it is queried for
 
@@ -246,9 +249,11 @@ class Planner:
         return AdjacentWorlds(rest, pair, description)
 
     def _reached(self, worlds: AdjacentWorlds) -> float:
-        """Return the distance that the policy reaches between two worlds in a run of either."""
+        """Return the mean distance that the policy reaches between two worlds in some runs."""
         queries = Queries(self.plan(worlds))
-        return float(attack(self.config, worlds, queries, 1, progress=False).distances.max())
+        return float(
+            attack(self.config, worlds, queries, REHEARSALS, progress=False).distances.mean()
+        )
 
     # Queries ------------------------------------------------------------------------------------
 

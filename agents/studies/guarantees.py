@@ -51,7 +51,7 @@ from agents.tables import (
 from agents.watchers import LENGTHS
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
-from dptse_env.privacy import epsilon_of
+from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import Paced, Pacing, ReleaseModel, Task, Traffic
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
@@ -170,7 +170,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "a second": {"unit": "event"},
     "private boundary inputs": {"boundary": "private"},
 }
-GUARANTEES = ((5.0, DELTA), (1.0, DELTA), (5.0, STRICT))
+GUARANTEES = ((5.0, DELTA), (1.0, DELTA), (5.0, STRICT), (5.0, 1e-6))
 CAPPED = {"release": "capped"}
 LADDER: tuple[tuple[str, dict[str, Any], int], ...] = (
     ("1. `capped`, EKF, `paper`", {"estimator": "ekf", "schedule": "paper", **CAPPED}, 1),
@@ -323,7 +323,9 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
     }
     yield compared(ask, "(rung)", ladder, REFUSED)
     yield f"## Ladder at other (ε, δ): {ERRORS[DENSITY]}"
-    at = {f"({e:g}, {d:g})": {"epsilon": e, "delta": d} for e, d in GUARANTEES}
+    at = {
+        f"({e:g}, {d:g}), μ = {mu_of(e, d):.2f}": {"epsilon": e, "delta": d} for e, d in GUARANTEES
+    }
     again = {name: (DENSITY, partial(paid, **changes)) for name, changes, _ in LADDER}
     yield sweep(ask, "rung", at, again)
     yield "## Filters with demand states, and the random walk, `paced`"

@@ -1,4 +1,4 @@
-"""The query suite: thirteen tasks with fixed traffic and noise, on which any policy is scored.
+"""The query suite: fourteen tasks with fixed traffic and noise, on which any policy is scored.
 
 In each task the paper's schedule has the score 0 and the error oracle 1. The rows of the policies
 that come with the package are in ``results/suite``; those of another one are put beside them.
@@ -39,7 +39,7 @@ from agents.tables import (
 from dptse_env.config import parse_seeds
 from dptse_env.parts import privacy_report
 
-NAME = "query-suite-v2"
+NAME = "query-suite-v3"
 """Changes with anything that a score depends on."""
 
 PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
@@ -75,10 +75,10 @@ class Task:
 
     @cached_property
     def guarantee(self) -> str:
-        """The guarantee for a trip, as (epsilon, delta), or that there is none."""
+        """The guarantee for a trip, as mu and (epsilon, delta), or that there is none."""
         with quietly():
             report = privacy_report(make_config(self.env, self.keywords))
-        pair = f"({report.epsilon:.4g}, {report.claimed_delta:g})"
+        pair = f"μ = {report.mu:.2f}, ({report.epsilon:.4g}, {report.claimed_delta:g})"
         return f"none: {pair}" if report.void_reasons else pair
 
 
@@ -100,6 +100,10 @@ TASKS = (
     _task("paced-ekf-2", "PrivateHighway-v1, EKF, B = 2", PRIVATE, "ekf", 2),
     _task("paced-recurrent-2", "PrivateHighway-v1, recurrent, B = 2", PRIVATE, "recurrent", 2),
     _task("paced-recurrent-5", "PrivateHighway-v1, recurrent, B = 5", PRIVATE, "recurrent", 5),
+    _task(
+        "strict-recurrent-2", "paced-recurrent-2 with a delta of 1e-06", PRIVATE, "recurrent", 2,
+        delta=1e-6,
+    ),
     _task(
         "other-drivers", "paced-recurrent-2 with drivers by Krauss and two peaks of demand",
         PRIVATE, "recurrent", 2, **OTHER_DRIVERS,
@@ -131,8 +135,8 @@ LEARNED = {
     "private-highway": _CAPPED,
     "capped-roads": _CAPPED,
     "paced-roads": (
-        "paced-ekf-2", "paced-recurrent-2", "paced-recurrent-5", "other-drivers", "short",
-        "long-recurrent-8", "long-ekf-4", "long-recurrent-2",
+        "paced-ekf-2", "paced-recurrent-2", "paced-recurrent-5", "strict-recurrent-2",
+        "other-drivers", "short", "long-recurrent-8", "long-ekf-4", "long-recurrent-2",
     ),
 }  # fmt: skip
 """Policies that come with the package, and the tasks with the observations that they know."""

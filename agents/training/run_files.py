@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from agents.files import first_difference, write_json
+from dptse_env.utils.fields import cut, read_json, require
 from dptse_env.utils.files import write_atomically
 
 PLAN, CHECKPOINT, PROGRESS = "plan.json", "checkpoint.pt", "progress.csv"
@@ -45,12 +46,8 @@ def check_plan(folder: Path, plan: Mapping[str, Any]) -> None:
         if folder.exists() and any(folder.iterdir()):
             raise ValueError(f"{folder} is not empty and has no {PLAN}: choose another --output")
         return
-    try:
-        kept = json.loads(path.read_bytes())
-    except ValueError as problem:
-        raise ValueError(f"{path} is damaged: {problem}") from problem
-    if not isinstance(kept, dict):
-        raise ValueError(f"{path} is damaged: it has no plan")
+    kept = read_json(path)
+    require(isinstance(kept, dict), str(path), "the plan of a training", kept)
     difference = first_difference(kept, {"format": FORMAT, **plan})
     if difference is not None:
         raise ValueError(
@@ -83,7 +80,7 @@ def read_progress(folder: Path) -> list[Row]:
                 for row in csv.DictReader(file, strict=True)
             ]
     except (ValueError, TypeError, csv.Error) as problem:
-        message = f"{path} is damaged: {problem}; remove the folder to start over"
+        message = f"{path} is damaged: {cut(problem)}; remove the folder to start over"
         raise ValueError(message) from problem
     if not rows or any("update" not in row for row in rows):
         raise ValueError(f"{path} is damaged: rows are missing; remove the folder to start over")
@@ -114,6 +111,6 @@ def read_checkpoint(folder: Path) -> dict[str, Any] | None:
     try:
         content: dict[str, Any] = torch.load(path, weights_only=True)
     except Exception as problem:
-        message = f"{path} is damaged: {problem}; remove the folder to start over"
+        message = f"{path} is damaged: {cut(problem)}; remove the folder to start over"
         raise ValueError(message) from problem
     return content

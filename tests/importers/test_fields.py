@@ -151,15 +151,26 @@ def test_speeds_in_metres_a_second_are_told_in_light_traffic_alone(tmp_path):
         source.read(4, 110.0)
 
 
-def test_a_few_cells_may_be_odd(tmp_path):
-    source, speed = write(tmp_path), np.full((10, 90), 60.0)
-    expected = source.read(4, 110.0)[0]
-    speed.flat[:9] = 300.0  # 329 km/h in 1 % of the cells
-    np.savetxt(tmp_path / "speed.txt", speed)
-    np.testing.assert_array_equal(source.read(4, 110.0)[0], expected)
-    speed.flat[:10] = 300.0
-    np.savetxt(tmp_path / "speed.txt", speed)
-    with pytest.raises(ValueError, match=r"likely none that is known, got 'ft/s': 1 % of speeds"):
+@pytest.mark.parametrize(
+    ("name", "usual", "odd", "message"),
+    [
+        ("speed", 60.0, 300.0, r"likely none that is known, .*: 1 % of speeds are above 200"),
+        (
+            "density",
+            0.02,
+            0.3,
+            r"likely veh/m, .*: 1 % of cells are above 800 v",
+        ),
+    ],
+)
+def test_a_few_cells_may_be_odd(name, usual, odd, message, tmp_path):
+    source, table = write(tmp_path), np.full((10, 90), usual)
+    table.flat[:9] = odd  # 1 % of the cells
+    np.savetxt(tmp_path / f"{name}.txt", table)
+    assert source.read(4, 110.0)[0].shape == (10, 90)
+    table.flat[:10] = odd
+    np.savetxt(tmp_path / f"{name}.txt", table)
+    with pytest.raises(ValueError, match=rf"{name}\.txt: {name}_unit must be .*{message}"):
         source.read(4, 110.0)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import gzip
 import json
-import shutil
 
 import numpy as np
 import polars as pl
@@ -278,45 +277,6 @@ def test_rows_of_another_length_are_refused_with_their_number(kind, change, got,
     message = rf"row 4001: it must have {len(fields)} fields, got {got}$"
     with pytest.raises(TrajectoryError, match=message):
         run(path, source)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["csv", "csv.gz", "parquet", "json", "xml"])
-def test_damaged_files_are_imported_or_refused(kind, fcd, tmp_path, monkeypatch):
-    monkeypatch.setattr("dptse_env.importers.folder.write_report", lambda *_: {})
-    points, path, source = stream(seconds=45.0, period=0.5), tmp_path / f"a.{kind}", PLAIN
-    content = plain(tmp_path / "a.txt", points).read_bytes()
-    if kind == "parquet":
-        pl.read_csv(tmp_path / "a.txt").write_parquet(path)
-        content = path.read_bytes()
-    elif kind == "json":
-        source = Source("i24", layout=Layout(origin=310000.0))
-        content = json.dumps(i24(points)).encode()
-    elif kind == "xml":
-        source, content = Source("fcd"), (fcd[0] / "fcd.xml").read_bytes()[:200_000]
-    if kind == "csv.gz":
-        content = gzip.compress(content)
-    (tmp_path / "a.txt").unlink()
-    rng = np.random.default_rng(0)
-    pieces = (b'"', b",", b"\n", b"\r", b"\0", b"nan", b"1e999", b"-1e9", b"[", b"<", b"\xff")
-    told = []
-    for case in range(60):
-        damaged, place = bytearray(content), int(rng.integers(len(content)))
-        if case % 3 == 0:
-            damaged[place] = rng.integers(256)
-        elif case % 3 == 1:
-            damaged[place : place + rng.integers(3)] = rng.choice(pieces)
-        else:
-            damaged = damaged[:place]
-        path.write_bytes(damaged)
-        try:
-            run(path, source, splits=TRAINING)
-        except ValueError as problem:
-            told.append(str(problem))
-        shutil.rmtree(tmp_path / "imported", ignore_errors=True)
-        assert list(tmp_path.iterdir()) == [path]
-    assert len(told) > 20
-    assert all(str(path) in each and len(each) < 600 for each in told)
 
 
 # -- SUMO ------------------------------------------------------------------------------------------

@@ -4,6 +4,8 @@ import sys
 import pytest
 
 from dptse_env.privacy import mu_of
+from dptse_env.release import ReleaseModel
+from dptse_env.release.gaussian import Paper
 from scripts.audit import Args, main
 from tests.helpers import SHORT
 from tests.scripts.commands import refused
@@ -44,6 +46,20 @@ def test_what_the_paper_promises_is_rejected_with_vehicles_of_the_record(tmp_pat
     # The claim to users, not the account.
     assert found["result"]["claim"]["mu"] == pytest.approx(mu_of(1.0, 0.05))
     assert "boundary_inputs" in found["privacy"]["void_reasons"]
+
+
+class Unstated(Paper):
+    """Releases as in the paper, of which nothing is stated."""
+
+    report = ReleaseModel.report
+
+
+def test_a_model_that_states_nothing_is_held_to_what_was_asked_of_it(tmp_path):
+    privacy = {"preset": f"{__name__}:Unstated", "epsilon": 1.0}
+    _, found = run(tmp_path, privacy, target="replaced", runs=100)
+    assert found["verdict"] == "rejected"
+    assert found["result"]["claim"]["mu"] == pytest.approx(mu_of(1.0, 0.05))
+    assert found["privacy"]["mu"] is None
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.4])

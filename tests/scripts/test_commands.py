@@ -175,7 +175,9 @@ ENVIRONMENTS = {
     "dptse_env:dptse/Nowhere-v0": "env must be",
     "no_such_module:dptse/PaperHighway-v0": "env must be",
     "CartPole-v1": "env must be",
-    f"{SHORT} 3": "env must be",
+    f"{SHORT} 3": "env must be an id and a JSON object, got '3'",
+    f"{SHORT} {'[' * 100_000}": "env must be JSON: maximum recursion depth",
+    f'{SHORT} {{"epsilon": {"9" * 5000}}}': "env must be JSON: Exceeds the limit",
     f'{SHORT} {{"cargo": 1}}': "cargo",
     f'{SHORT} {{"corridor": {{"duration": -3}}}}': "corridor.duration must be",
 }

@@ -17,6 +17,8 @@ from tests.scripts.commands import refused, run_command
 
 WALK = f'{SHORT} {{"estimator": "random_walk"}}'
 
+SURE = f'{SHORT} {{"estimator_settings": {{"process_noise": [0, 0]}}}}'
+
 
 def rows_of(folder, policy=None):
     rows = read_rows("evaluation", folder)
@@ -115,6 +117,8 @@ def test_estimators_and_keywords_reach_the_environment():
     [
         (["--schedules", "best"], "schedule must be one of"),
         (["--estimators", "kf"], "estimator must be one of"),
+        # The first could be played.
+        (["--env", SURE, "--estimators", "ekf", "mhe"], "estimator_settings.process_noise[0] must"),
         (["--seeds", "2000"], "seeds must be"),
         (["--policies", "a/b.zip", "c/a/b.zip"], "'a/b'"),
         (["--policies", "nobody.zip"], "nobody.zip"),
@@ -122,5 +126,6 @@ def test_estimators_and_keywords_reach_the_environment():
     ],
 )
 def test_bad_arguments_are_named_and_nothing_is_written(words, message, tmp_path):
-    assert message in refused("evaluate", "--env", SHORT, *words, "--output", tmp_path / "out")
+    words = words if "--env" in words else ["--env", SHORT, *words]
+    assert message in refused("evaluate", *words, "--output", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -50,7 +50,7 @@ def test_rounds_are_read_from_text():
         (["--traffic", "0:2000"], r"traffic must be traffic seeds in 0\.\.999"),
         (["--rounds", "own:0:4"], r"rounds\.scenarios must be an integer in 1\.\."),
         (["--plan", "[3]"], "plan must be a mapping"),
-        (["--plan", "{"], "plan must be a JSON object"),
+        (["--plan", "{"], "plan must be JSON: "),
         (["--plan", '{"wide": 3}'], r"plan\.wide is unknown"),
         (["--plan", '{"ranges": {"largest_share": 0}}'], r"ranges\.largest_share must be in"),
     ],

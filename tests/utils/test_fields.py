@@ -7,6 +7,7 @@ import pytest
 
 from dptse_env.utils import fields
 from dptse_env.utils.fields import from_mapping
+from tests.hostile import nested
 
 
 @dataclass(frozen=True)
@@ -93,3 +94,17 @@ def test_numbers_come_back_plain_and_bad_ones_are_named():
     for value in (0, 6, 1.0, "1", True, None):
         with pytest.raises(ValueError, match=rf"^n must be .*, got {value!r}$"):
             fields.integer("n", value, 1, 5)
+
+
+def test_values_are_shown_in_one_short_line():
+    for value, text in (
+        (10**5000, "an integer of 5000 digits"),
+        ([10**5000], "[an integer of 5000 digits]"),
+        (10**20, "100000000000000000000"),
+        ("a\nb", r"'a\nb'"),
+        (nested(5000), "[[[[[[...]]]]]]"),
+        (np.zeros((2, 2)), "array([[0., 0.], [0., 0.]])"),
+    ):
+        assert fields.shown(value) == text
+    assert fields.cut("a b\n") == r"a b\n"
+    assert max(len(fields.shown("x" * 10**6)), len(fields.cut("x" * 10**6))) <= 203

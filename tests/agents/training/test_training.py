@@ -272,7 +272,7 @@ def test_damaged_and_foreign_files_are_refused(whole, tmp_path):
     checkpoint = (whole()[0] / CHECKPOINT).read_bytes()
     refused(CHECKPOINT, checkpoint[:1000], r"checkpoint\.pt is damaged")
     refused(CHECKPOINT, None, r"checkpoint\.pt is missing, although progress\.csv")
-    refused(PLAN, b'{"env', r"plan\.json is damaged")
+    refused(PLAN, b'{"env', r"plan\.json must be JSON: ")
     refused(PLAN, None, r"is not empty and has no plan\.json")
     older = json.loads((whole()[0] / PLAN).read_text()) | {"format": 3}
     refused(PLAN, json.dumps(older).encode(), "format is 3 there and 4 now")
