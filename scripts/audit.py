@@ -1,7 +1,6 @@
 """Attack the privacy of an environment, and bound from below what its releases reveal.
 
 dptse audit --env dptse_env:dptse/ShortHighway-v0 --runs 100
-dptse audit --env dptse_env:dptse/PaperHighway-v0 --one-run
 """
 
 from __future__ import annotations

@@ -151,12 +151,12 @@ ALL = [
 @pytest.mark.parametrize("policy", ["hunter", "round-robin"])
 @pytest.mark.parametrize(("spans", "levels"), [((1, 2), (0.5, 1.0, 3.0)), ((2,), (1.0,))])
 def test_options_of_several_segments_and_prices_reach_mu_and_no_more(spans, levels, policy, record):
-    setting = dataclasses.replace(paced("ekf", bandwidth=4), query_spans=spans, price_levels=levels)
+    setting = dataclasses.replace(paced("ekf", bandwidth=3), query_spans=spans, price_levels=levels)
     planner = Planner(setting, policy)
     for kind in ("worst-case", "replaced"):
         worlds = planner.choose(record, kind)
         plan = planner.plan(worlds)
-        assert (plan @ setting.queries.cost).max() <= 4
+        assert (plan @ setting.queries.cost).max() <= 3
         least = 0.95 if (kind, policy) == ("worst-case", "hunter") else 0.5
         assert least < reached(setting, worlds, policy) <= 1.0 + 1e-9
 
