@@ -9,6 +9,7 @@ shows it. An error is one line: ``<path> must be <allowed>, got <value>``.
 import dataclasses
 import json
 import math
+import os
 import re
 import reprlib
 import tomllib
@@ -371,7 +372,7 @@ def read_json(path: str | Path) -> Any:
     return parse_json(text, str(path))
 
 
-def read_toml(path: str | Path, kind: str) -> dict[str, Any]:
+def read_toml(path: str | os.PathLike[str], kind: str) -> dict[str, Any]:
     """Parse a TOML file.
 
     Args:
