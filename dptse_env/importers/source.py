@@ -7,16 +7,14 @@ examples.
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from dptse_env.utils.fields import (
     Interval,
     checked_fields,
-    cut,
     from_mapping,
+    read_toml,
     require,
     require_name,
 )
@@ -147,13 +145,7 @@ def read_source(path: str | os.PathLike[str]) -> Source:
         ValueError: It cannot be read, is no TOML, or a field is unknown or out of range; the
             message starts with the file's path.
     """
-    path = Path(path)
-    try:
-        content: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as problem:
-        raise ValueError(f"{path}: the mapping cannot be read: {problem.strerror}") from problem
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
-        raise ValueError(f"{path}: a mapping must be TOML: {cut(problem)}") from problem
+    content = read_toml(path, "mapping")
     try:
         return from_mapping(Source, content, "source")
     except ValueError as problem:

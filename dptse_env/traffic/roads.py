@@ -14,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,15 +23,12 @@ import tomli_w
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, IncidentDistribution
-from dptse_env.utils.fields import cut, from_mapping, shown
+from dptse_env.utils.fields import from_mapping, read_toml, shown
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.registry import Registry, require_registered
 
 SUFFIX = ".toml"
 """Ending of the name of a road file."""
-
-LARGEST_FILE = 10_000_000
-"""Bytes of a road file at most."""
 
 ASSUMED_PACE = 3.0
 """Assumed ratio of the average dwell to the time of a crossing at the speed limit, where a file
@@ -198,7 +194,7 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
             and the field.
     """
     path = Path(path)
-    content = _content(path)
+    content = read_toml(path, "road file")
     environment = content.pop(_ENVIRONMENT, {})
     if not isinstance(environment, Mapping):
         raise ValueError(f"{path}: {_ENVIRONMENT} must be a table, got {shown(environment)}")
@@ -248,17 +244,6 @@ def write_corridor(
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())
     write_atomically(path, head + tomli_w.dumps(content))
-
-
-def _content(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise ValueError(f"{path}: a road file must have at most {LARGEST_FILE} bytes")
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as problem:
-        raise ValueError(f"{path}: the road file cannot be read: {problem.strerror}") from problem
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
-        raise ValueError(f"{path}: a road file must be TOML: {cut(problem)}") from problem
 
 
 def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:

@@ -9,8 +9,10 @@ shows it. An error is one line: ``<path> must be <allowed>, got <value>``.
 import dataclasses
 import json
 import math
+import os
 import re
 import reprlib
+import tomllib
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,6 +27,9 @@ import numpy as np
 
 T = TypeVar("T")
 N = TypeVar("N", int, float)
+
+LARGEST_TOML = 10_000_000
+"""Largest size of a TOML file [bytes]."""
 
 LONGEST_SEQUENCE = 100_000
 """Largest number of items in a sequence; checking more would take minutes."""
@@ -365,6 +370,32 @@ def read_json(path: str | Path) -> Any:
     except OSError as problem:
         raise ValueError(f"{path} cannot be read: {problem.strerror}") from problem
     return parse_json(text, str(path))
+
+
+def read_toml(path: str | os.PathLike[str], kind: str) -> dict[str, Any]:
+    """Parse a TOML file.
+
+    Args:
+        path: The file.
+        kind: What it is, for messages, such as "road file".
+
+    Raises:
+        ValueError: It cannot be read, is too large, or is no TOML; the message starts with its
+            path.
+    """
+    path = Path(path)
+    try:
+        size, content = path.stat().st_size, b""
+        if size <= LARGEST_TOML:
+            content = path.read_bytes()
+    except OSError as problem:
+        raise ValueError(f"{path}: the {kind} cannot be read: {problem.strerror}") from problem
+    require(size <= LARGEST_TOML, f"{path}: a {kind}", f"of at most {LARGEST_TOML} bytes", size)
+    try:
+        return tomllib.loads(content.decode("utf-8-sig"))
+    # Integers of thousands of digits are a ValueError, and no TOMLDecodeError.
+    except (ValueError, RecursionError) as problem:
+        raise ValueError(f"{path}: a {kind} must be TOML: {cut(problem)}") from problem
 
 
 def check_object(content: Any, path: str, keys: Mapping[str, type]) -> dict[str, Any]:

@@ -87,6 +87,7 @@ def test_what_a_file_leaves_out_is_derived_from_the_road(road):
     [
         ("lanes = 2", "lane = 2", r"My road\.toml: corridor\.lane is unknown; allowed: name"),
         ("n_mainline = 8", "", r"My road\.toml: corridor\.n_mainline is missing"),
+        ("1800", "9" * 5000, r"My road\.toml: a road file must be TOML: Exceeds the limit"),
         ("1800", '"many"', r"My road\.toml: corridor\.demand\.mainline\[0\]\[1\]"),
         ("lanes = 2", "lanes = 2\nlanes = 3", r"must be TOML: .*line 4"),
         ("bandwidth = 3", 'corridor = "x"', r"environment\.corridor must be left out"),

@@ -19,7 +19,7 @@ from dptse_env.importers.network.net import (
     successors,
 )
 from dptse_env.traffic.own_sumo import TOLERANCE, Stretch
-from dptse_env.utils.fields import require
+from dptse_env.utils.fields import require, shown
 
 SHORTEST = 40.0
 """Shortest segment [m]."""
@@ -204,7 +204,9 @@ class Chain:
                 allowed = f"a length in (0, {LONGEST:g}] m and a finite speed above 0"
                 found = f"{lane.getLength()} m and {lane.getSpeed()} m/s"
                 name = lane.getID()
-                raise ValueError(f"net: {net.path}: lane {name!r} must have {allowed}, got {found}")
+                raise ValueError(
+                    f"net: {net.path}: lane {shown(name)} must have {allowed}, got {found}"
+                )
         longest = max(float(lane.getLength()) for lane in edge.getLanes())
         self._parts.append(_Part(edge.getID(), start, start + length, longest))
         return start + length
@@ -333,7 +335,7 @@ def _find_ramps(net: Net, path: list[Any], left_out: Collection[str], wanted: fl
     for name in left_out:
         if name not in names:
             raise ValueError(
-                f"leave_out: {name!r} must be an edge that joins or leaves the path, one of "
+                f"leave_out: {shown(name)} must be an edge that joins or leaves the path, one of "
                 f"{', '.join(sorted(names)) or 'none'}"
             )
     mouths = [mouth for mouth in mouths if mouth[2].getID() not in left_out]
@@ -428,7 +430,7 @@ def _limits(chain: Chain, ends: Ends) -> tuple[float, float]:
         ("first_position", chain.edges[0], ends[0]),
         ("last_position", chain.edges[-1], last if ends[1] is None else ends[1]),
     ):
-        allowed = f"in [0, {edge.getLength():.1f}] m, the length of {edge.getID()!r}"
+        allowed = f"in [0, {edge.getLength():.1f}] m, the length of {shown(edge.getID())}"
         require(0.0 <= position <= edge.getLength(), where, allowed, position)
         places.append(float(position))
     return places[0], chain.length - last + places[1]

@@ -12,6 +12,8 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.sax import SAXException
 
+from dptse_env.utils.fields import shown
+
 NEWEST_VERSION = (1, 20)
 """Newest version of network files that the supported release of SUMO reads."""
 
@@ -69,9 +71,9 @@ class Net:
         if name not in self.edges:
             near = difflib.get_close_matches(name, self.edges, n=3)
             hint = f"; similar: {', '.join(near)}" if near else ""
-            raise ValueError(f"{where}: {self.path} has no edge {name!r}{hint}")
+            raise ValueError(f"{where}: {self.path} has no edge {shown(name)}{hint}")
         if not self.edges[name].allows(VEHICLE_CLASS):
-            raise ValueError(f"{where}: edge {name!r} must be open to cars, got a closed one")
+            raise ValueError(f"{where}: edge {shown(name)} must be open to cars, got a closed one")
         return self.edges[name]
 
     def path_along(self, names: Sequence[str]) -> list[Any]:
@@ -84,13 +86,13 @@ class Net:
         path = [self.edge(name, "path") for name in names]
         for place, name in enumerate(names):
             if name in names[:place]:
-                raise ValueError(f"path: must not be a loop, got edge {name!r} twice")
+                raise ValueError(f"path: must not be a loop, got edge {shown(name)} twice")
         for edge, following in pairwise(path):
             if not connections(edge, following):
                 onward = ", ".join(each.getID() for each in successors(edge)) or "none"
                 raise ValueError(
-                    f"path: edge {edge.getID()!r} must be connected to {following.getID()!r}, got "
-                    f"connections to {onward}"
+                    f"path: edge {shown(edge.getID())} must be connected to "
+                    f"{shown(following.getID())}, got connections to {onward}"
                 )
         return path
 
@@ -103,7 +105,9 @@ class Net:
         ends = self.edge(first, "first"), self.edge(last, "last")
         path, _ = self._net.getShortestPath(*ends, vClass=VEHICLE_CLASS)
         if path is None:
-            raise ValueError(f"last: edge {last!r} must be reachable from {first!r}, and is not")
+            raise ValueError(
+                f"last: edge {shown(last)} must be reachable from {shown(first)}, and is not"
+            )
         return self.path_along([edge.getID() for edge in path])
 
     def crossing(self, edge: Any, following: Any) -> list[list[Any]]:
@@ -123,7 +127,7 @@ class Net:
         """Return the internal edges of a connection, in the direction of travel."""
         way: list[Any] = []
         while via := connection.getViaLaneID():
-            where = f"net: {self.path}: lane {via!r} must lead over its junction"
+            where = f"net: {self.path}: lane {shown(via)} must lead over its junction"
             try:
                 lane = self._net.getLane(via)
                 connection = lane.getOutgoing()[0]
@@ -139,7 +143,8 @@ class Net:
         for edge in path[:-1]:
             junction = edge.getToNode()
             if junction and "traffic_light" in (junction.getType() or ""):
-                yield f"traffic light at junction {junction.getID()!r}, after {edge.getID()!r}"
+                where = f"junction {junction.getID()!r}, after {edge.getID()!r}"
+                yield f"traffic light at {where}"
         names = {edge.getID() for edge in path}
         for roundabout in self._net.getRoundabouts():
             if shared := sorted(names & set(roundabout.getEdges())):
@@ -202,7 +207,7 @@ def _check_version(path: Path, version: str) -> None:
     try:
         numbers = tuple(int(part) for part in version.split(".")[:2])
     except ValueError as error:
-        raise ValueError(f"net: {path}: version must be numbers, got {version[:20]!r}") from error
+        raise ValueError(f"net: {path}: version must be numbers, got {shown(version)}") from error
     if numbers > NEWEST_VERSION:
         newest = ".".join(map(str, NEWEST_VERSION))
         raise ValueError(

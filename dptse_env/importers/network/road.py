@@ -78,7 +78,10 @@ def import_road(
     if begin is None:
         require(float(files.begin).is_integer(), "begin", "whole seconds", files.begin)
         begin = int(files.begin) + warm_up
-    draft = _draft(files, layout, name, duration, begin, warm_up, speed_limit)
+    try:
+        draft = _draft(files, layout, name, duration, begin, warm_up, speed_limit)
+    except ValueError as problem:
+        raise ValueError(f"net: {files.net}: {problem}") from problem
     try:
         record = simulate_in_worker(draft, seed)
     except RecordingError as error:
