@@ -214,7 +214,7 @@ MUTANTS = (
     Mutant(
         "a deviation at the clip is rounded up", 6, "release/vehicles.py",
         "most = np.floor(clip / grid[c])", "most = np.ceil(clip / grid[c])",
-        "test_guarantee.py",
+        "release/test_vehicles.py",
     ),
     Mutant(
         "deviations are charged unclipped and released clipped", 6, "release/vehicles.py",
