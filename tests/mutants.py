@@ -236,7 +236,7 @@ MUTANTS = (
         "the noise of deviations does not follow the ratio", 6, "release/paced.py",
         "self._flow_noise = settings.clip / math.sqrt(settings.ratio)",
         "self._flow_noise = settings.clip",
-        "test_guarantee.py",
+        "release/test_paced.py",
     ),
     Mutant(
         "overlaps are charged once", 7, "release/vehicles.py",
