@@ -60,7 +60,7 @@ test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
 	$(BIN)/python -m pytest -m 'slow and not ray' -n 2 --dist loadfile
 
-mutants: setup  ## Break each line of the proof in a copy, and see a fast test fail; ten minutes.
+mutants: setup  ## Break each line of the proof in a copy, and see a fast test fail; a quarter of an hour.
 	$(BIN)/python -m tests.mutants
 
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.

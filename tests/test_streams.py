@@ -46,6 +46,15 @@ def test_two_seeds_share_no_noise_on_one_record():
         assert abs(np.corrcoef(*pair)[0, 1]) < 0.2
 
 
+def test_the_next_episode_of_a_sequence_shares_no_noise_with_the_last_on_one_record():
+    process, generators = begin((0, 0), EVERYWHERE), [np.random.default_rng(k) for k in (1, 2)]
+    played = []
+    for _ in range(2):
+        process.reset(TWO, generators, EVERYWHERE)
+        played.append(noise(process))
+    assert (np.abs(played[0] - played[1]) > grid(process)).mean() > 0.99
+
+
 @pytest.mark.parametrize(
     "options", [{"traffic_seed": [0, 1], "start": 0}, {"traffic_seed": 0, "start": [0, 100]}]
 )
