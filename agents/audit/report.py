@@ -129,10 +129,7 @@ class Finding:
             "gaussian_epsilon": self.gaussian_epsilon,
             "power": self.power,
             "detectable_mu": self.detectable if math.isfinite(self.detectable) else None,
-            "privacy": {
-                name: None if value == math.inf else value  # where nothing is stated
-                for name, value in self.privacy.to_dict().items()
-            },
+            "privacy": self.privacy.to_dict(),
             "arguments": {key: str(value) for key, value in arguments.items()},
             "versions": {name: version(name) for name in ("dptse-env", "numpy", "scipy")},
         }

@@ -110,8 +110,12 @@ class PrivacyReport:
         return replace(self, guarantee="none", void_reasons=in_order(found))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a fresh dict of plain JSON values, which includes the entries of `details`."""
+        """Return a fresh dict of plain JSON values, which includes the entries of `details`.
+
+        None stands for what is infinite, since nothing is stated.
+        """
         report: dict[str, Any] = asdict(self)
+        report |= {name: None for name in ("mu", "epsilon") if math.isinf(report[name])}
         report["void_reasons"] = list(self.void_reasons)
         report["releases"] = [asdict(quantity) for quantity in self.releases]
         report.update(report.pop("details"))

@@ -109,6 +109,7 @@ def test_a_model_claims_no_guarantee_and_no_knowledge_by_default():
     found = release.report()
     assert (found.guarantee, found.void_reasons) == ("none", ("not_stated",))
     assert (found.speed_release, found.boundary_inputs) == ("flow", "private")
+    assert found.to_dict()["mu"] is None  # plain JSON has no infinity
     assert np.concatenate(release.spent(ONE, ONE)).tolist() == [np.inf, np.inf]
     assert release.private(ONE, ONE) == {}
     assert release.budgets_spent(ONE).tolist() == [0.0]
