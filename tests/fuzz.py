@@ -78,7 +78,7 @@ KEYWORDS = (
     "epsilon", "delta", "incident", "demand",
 )  # fmt: skip
 PATHS = (*KEYWORDS, r"no_such\nkeyword", "none.toml", "none.json")
-"""What a message on a configuration may begin with."""
+"""Beginnings of messages on a configuration."""
 
 
 # --- configurations -------------------------------------------------------------------------------
@@ -158,7 +158,7 @@ NAMES = {
     "demand": ["preset", "random"],
     "traffic_seeds": ["0:2", "0:20000", "1:0", [0, 1], [1, 1], [], [5e-324]],
 }
-"""What keywords may be beside mappings of fields."""
+"""Values of keywords beside mappings of fields."""
 ONLY_NAMES = ("estimator", "action", "reward", "backend", "bandwidth_unit")
 
 

@@ -43,7 +43,7 @@ TOKENS = (
     b"\0", b"\xff\xfe", b"\r", b"\n", b"", b"1", b"2", b"3", b"7.5", b"0.2", b"100", b"true",
     b"1", b"2", b"0.5", b"60",
 )  # fmt: skip
-"""What takes the place of a word of a text, or a few bytes of it; some of it may be in order."""
+"""Substitutes for a word of a text, or a few bytes of it; some of them may be in order."""
 
 
 def changed(content, rng):

@@ -23,7 +23,7 @@ from dptse_env.utils.kernels import default_folder
 
 ROOT = Path(__file__).parents[1]
 SPARED = (".*", "__pycache__", "build", "dist", "results")
-"""What no copy needs, at any depth."""
+"""Names that no copy needs, at any depth."""
 
 MOST_SECONDS = 600.0
 """Time for the tests of a mutant, which may compile a kernel."""
@@ -31,7 +31,7 @@ MOST_SECONDS = 600.0
 UNSOUND = re.compile(
     r"numba\.|(Attribute|Index|Key|Name|Type|UnboundLocal)Error|ValueError: .*broadcast"
 )
-"""How tests fail where a mutant is no sound Python, which shows nothing."""
+"""Errors of tests where a mutant is no sound Python, which shows nothing."""
 
 
 class Mutant(NamedTuple):

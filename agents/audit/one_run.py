@@ -30,7 +30,7 @@ KINDS = {
     "fast": "stands, or drives at the speed limit",
     "absent": "stands, or is not there",
 }
-"""What the coin of a canary decides."""
+"""The two ways of a canary between which its coin decides."""
 
 RATIO = 1.3
 """Ratio of the lengths of slots that are tried."""
@@ -79,7 +79,7 @@ class Design:
 
 @dataclass(frozen=True)
 class OneRun:
-    """What an adversary makes of one run with n canaries.
+    """An adversary's scores of one run with n canaries.
 
     Attributes:
         design: Canaries and queries.

@@ -16,7 +16,7 @@ PLUGINS = "dptse_env.plugins"
 called once, when a name is looked up that is not known yet."""
 
 OR_IMPORTED = ", or 'package.module:Name'"
-"""What else than a name a message allows; not so in files."""
+"""Addition to the names that a message allows; not so in files."""
 
 _PACKAGE = __name__.partition(".")[0]
 _plugins_loaded = False
