@@ -213,7 +213,7 @@ MUTANTS = (
     ),
     Mutant(
         "a deviation at the clip is rounded up", 6, "release/vehicles.py",
-        "most = np.floor(clip / grid[c])", "most = np.ceil(clip / grid[c])",
+        "most[c] = np.floor(clip / grid[c])", "most[c] = np.ceil(clip / grid[c])",
         "release/test_vehicles.py",
     ),
     Mutant(
@@ -250,7 +250,7 @@ MUTANTS = (
     ),
     Mutant(
         "deviations below the centre are not clipped", 8, "release/vehicles.py",
-        "steps = min(max(steps, -most), most)", "steps = min(steps, most)",
+        "steps = min(max(steps, -most[c]), most[c])", "steps = min(steps, most[c])",
         "test_guarantee.py",
     ),
     Mutant(
@@ -506,7 +506,8 @@ MUTANTS = (
     ),
     Mutant(
         "the further bits of secure noise follow the seed", 18, "release/noise.py",
-        "if self._is_secure or generator is None:", "if generator is None:",
+        "if self._is_secure:\n            return lambda:",
+        "if row < 0:\n            return lambda:",
         "release/test_noise.py",
     ),
     Mutant(

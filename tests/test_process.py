@@ -103,7 +103,7 @@ def test_an_episode_may_pause_while_others_go_on():
 
 
 def test_a_second_is_predicted_then_released_and_then_read():
-    """What centres and prices are taken from has not seen the release of its own second."""
+    """Centres and prices come from a prediction before the release of its own second."""
     process, order = begun(1, privacy=PAID), []
 
     def spy(part, name):

@@ -219,9 +219,10 @@ class Noise:
 
     def _further(self, row: int) -> Callable[[], int]:
         """Return a source of 64 further bits, which leaves the stream of an episode as it is."""
-        generator = self._generators[row]
-        if self._is_secure or generator is None:
+        if self._is_secure:
             return lambda: int.from_bytes(os.urandom(8))
+        generator = self._generators[row]
+        assert generator is not None  # it has drawn the bits that leave the number open
         child = generator.spawn(1)[0]
         return lambda: int(child.integers(2**64, dtype=np.uint64))
 

@@ -287,13 +287,14 @@ def _collect(
     n_covering = np.empty(n_places, dtype=np.int64)
     covering = np.empty((n_places, n_columns), dtype=np.int64)
     counts, deviations = np.empty(n_columns, dtype=np.int64), np.empty(n_columns, dtype=np.int64)
-    grid = np.empty(n_columns)
+    grid, most = np.empty(n_columns), np.empty(n_columns)
     for k in range(episodes.size):
         n_covering[:] = 0
         counts[:] = 0
         deviations[:] = 0
         for c in range(n_columns):
             grid[c] = grid_of(sigma[k, c, 1])
+            most[c] = np.floor(clip / grid[c])
             if observed[k, c]:
                 for s in range(first[c], first[c] + span[c]):
                     covering[s, n_covering[s]] = c
@@ -308,9 +309,8 @@ def _collect(
                 reported = speed[g, row]
                 if reported < 0.0:
                     continue
-                most = np.floor(clip / grid[c])
                 steps = np.rint((min(reported, fastest) - centre[k, s]) / grid[c])
-                steps = min(max(steps, -most), most)
+                steps = min(max(steps, -most[c]), most[c])
                 d = steps * grid[c]
                 cost = prices[k, c] * (1.0 + ratio * d * d / (clip * clip))
                 if ledgers[g, v] + cost <= budget[g]:

@@ -138,7 +138,7 @@ class SumoScenario:
                 apart = end <= start + TOLERANCE
                 require(
                     apart,
-                    "corridor.network.columns",
+                    f"{_PATH}.columns",
                     f"without overlap on edge {edge!r}",
                     (start, end),
                 )

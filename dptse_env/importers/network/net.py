@@ -143,8 +143,7 @@ class Net:
         for edge in path[:-1]:
             junction = edge.getToNode()
             if junction and "traffic_light" in (junction.getType() or ""):
-                where = f"junction {junction.getID()!r}, after {edge.getID()!r}"
-                yield f"traffic light at {where}"
+                yield f"traffic light at junction {junction.getID()!r}, after {edge.getID()!r}"
         names = {edge.getID() for edge in path}
         for roundabout in self._net.getRoundabouts():
             if shared := sorted(names & set(roundabout.getEdges())):
