@@ -152,7 +152,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
         missing,
         lambda task, rows: write_table(_file_of(folder, task[0].id), rows),
         size=lambda task: len(task[1]),
-        progress=progress,
+        progress=progress and bool(missing),
         desc=study.name,
         unit="episode",
         mininterval=0.5,

@@ -92,8 +92,8 @@ def answer(choice: Choice) -> str:
     return (
         f"On {choice.road.corridor.name} take the estimator {choice.estimator} with the parameters "
         f"{choice.parameters}, and the query rule {choice.rule}: its error x 1000 on test traffic "
-        f"is {errors[0]}. An EKF with the inherited parameters {choice.home} and a round robin has "
-        f"{errors[1]} ({against(choice, chosen, home)} from there to here)."
+        f"is {errors[0]}, that of an EKF with the inherited parameters {choice.home} and a round "
+        f"robin {errors[1]} (difference {against(choice, chosen, home)})."
     )
 
 

@@ -175,7 +175,7 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
     if "bandwidth" not in keywords:
         keywords["bandwidth"] = min(base.bandwidth, max(corridor.n_mainline // 3, 1))
         decided.append("bandwidth")
-        remarks.append(f"{keywords['bandwidth']} queries a second, at most a third of the segments")
+        remarks.append(f"bandwidth {keywords['bandwidth']}: at most a third of the segments a second")
     is_field = corridor.recordings is not None and not has_vehicles(corridor.recordings)
     if is_field and "privacy" not in keywords and base.privacy.preset != "paper":
         keywords["privacy"] = "corrected"
