@@ -24,10 +24,7 @@ from dptse_env.importers.fields import FieldSource
 from dptse_env.utils.fields import integer, require
 from scripts.cli import Environment
 
-ENV = (
-    'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected", "bandwidth": 2, '
-    '"estimator_settings": {"recurrent": {"weights": "highway", "outside": true}}}'
-)
+ENV = 'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected", "bandwidth": 2}'
 
 
 @dataclass(frozen=True, kw_only=True)
