@@ -86,6 +86,9 @@ class Trajectories(Environment):
             Options(self.longest_gap, self.skip_start, self.skip_end, self.pause),
             {key: value for key, value in environment.items() if key != "traffic_seeds"},
         )
+        for file in imported.report["files"]:
+            if file["recognised"]:
+                print(f"{file['file']}: recognised {file['recognised']}")
         print_seeds(imported.seeds)
         print(f"road: {self.output / ROAD}\nreport: {self.output / REPORT}")
 
