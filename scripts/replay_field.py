@@ -51,8 +51,6 @@ class Args:
     """Release model of the noise, one that needs no vehicles."""
     epsilon: float = 1.0
     """Privacy parameter of the noise."""
-    delta: float = 0.05
-    """The same."""
     bandwidth: int = 2
     """Segments that are queried a second."""
     window: int = 450
@@ -76,7 +74,6 @@ class Args:
             "estimator_settings": settings,
             "privacy": self.preset,
             "epsilon": self.epsilon,
-            "delta": self.delta,
             "bandwidth": self.bandwidth,
         }
 
