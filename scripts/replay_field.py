@@ -46,7 +46,7 @@ class Args:
     parameters: str = "w99-3lane"
     """ARZ parameters: a shipped set or a JSON file."""
     settings: str | None = None
-    """Estimator settings: a set, a JSON file or JSON; else those tuned for the parameters."""
+    """Estimator settings: a set, a JSON file or JSON; else tuned ones."""
     preset: str = "corrected"
     """Release model of the noise, one that needs no vehicles."""
     epsilon: float = 1.0

@@ -198,9 +198,9 @@ class FieldSource:
         columns = np.arange(table.shape[1])
         for cell in np.flatnonzero(missing.any(axis=1)):
             edges = np.flatnonzero(np.diff(missing[cell], prepend=False, append=False))
-            for start, stop in edges.reshape(-1, 2):
+            for start, stop in edges.reshape(-1, 2).tolist():
                 if stop - start > most:
-                    raise ValueError(self._gap(path, cell, start, stop, table.shape))
+                    raise ValueError(self._gap(path, int(cell), start, stop, table.shape))
             known = ~missing[cell]
             table[cell] = np.interp(columns, columns[known], table[cell, known])
         warnings.warn(
