@@ -130,8 +130,6 @@ def world_cell(world: str, estimator: str, policy: str = ROUND_ROBIN) -> Cell:
     """Return the cell of an estimator in a world, with the network that the package has."""
     env, changes = {**WORLDS, **ELSEWHERE}[world]
     keywords = {**changes, "estimator": estimator}
-    if estimator == LEARNED:
-        keywords["estimator_settings"] = {"recurrent": {"weights": "highway", "outside": True}}
     return Cell(
         env,
         policy,
