@@ -47,7 +47,7 @@ MEANING = {
         "the shortest segments and steps of 1 s allow no higher one; longer segments would"
     ),
     ("jam_density", "least"): (
-        "no denser traffic was recorded: a jam may be denser than the model can say"
+        "the filter would take a road that is full at less, but traffic as dense was recorded"
     ),
     ("jam_density", "largest"): "no jam was recorded that would tell how dense one is",
     ("gamma", "least"): (
