@@ -105,7 +105,7 @@ def main(args: Args) -> None:
     choice = Choice(road, stages, shipped_sets(road))
     begin(1)
     density, speed = traffic_of(road.corridor, road.seeds["training"], library)
-    fit = fitted(choice, place, args.tries, 1.01 * float(density.max()))
+    fit = fitted(choice, place, library, args.tries, 1.01 * float(density.max()))
     name = fit.parameters.name
     keep(folder / f"{name}.json", fit, road)
     choice.sets[name] = {"parameters": str(folder / f"{name}.json")}
@@ -183,7 +183,7 @@ def shipped_sets(road: Road) -> dict[str, dict[str, Any]]:
     return {name: {"parameters": name} for name in stable}
 
 
-def fitted(choice: Choice, place: Place, tries: int, densest: float) -> Fit:
+def fitted(choice: Choice, place: Place, library: RecordLibrary, tries: int, densest: float) -> Fit:
     """Search parameters, from the shipped set with which the filter errs least in training."""
     road, base = choice.road, DEFAULT_PARAMETERS
     if choice.sets:
@@ -197,7 +197,7 @@ def fitted(choice: Choice, place: Place, tries: int, densest: float) -> Fit:
     start = start_from(load_parameters(base), road.corridor, name)
     labels = choice.labels("training", parameters="", estimator=FILTER, rule=ROUND_ROBIN)
     return fit_parameters(
-        road.corridor, choice.cell(labels), road.seeds["training"], start, densest, place, tries,
+        road.corridor, choice.cell(labels), road.seeds["training"], start, densest, library, tries,
         choice.stages / SEARCH,
     )  # fmt: skip
 

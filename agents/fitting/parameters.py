@@ -9,23 +9,17 @@ a shipped set, and the filter has the tuned settings of that set, which the fitt
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import optimize
 from tqdm import tqdm
 
-from agents.environments import quietly
-from agents.executors import run_in_order
 from agents.files import write_json
 from agents.play import Cell, play
-from agents.study import Place
 from dptse_env.config import TIME_STEP
-from dptse_env.evaluation import Row
 from dptse_env.model import ARZModel, ARZParameters
 from dptse_env.release import Traffic
 from dptse_env.traffic import Corridor, RecordLibrary
@@ -118,7 +112,7 @@ def fit_parameters(
     seeds: Sequence[int],
     start: ARZParameters,
     densest: float,
-    place: Place,
+    library: RecordLibrary,
     tries: int,
     kept: Path,
 ) -> Fit:
@@ -133,7 +127,7 @@ def fit_parameters(
         seeds: Training traffic.
         start: Where the search begins.
         densest: Largest density for a lane in training traffic [veh/km]; no jam is less dense.
-        place: Executor and records.
+        library: Source of the records.
         tries: Sets to try at most.
         kept: JSON file of what was tried.
     """
@@ -161,7 +155,7 @@ def fit_parameters(
         if key not in tried:
             tried[key] = _REFUSED
             if is_stable(parameters, corridor):
-                tried[key] = filter_error(cell, parameters, seeds, place)
+                tried[key] = filter_error(cell, parameters, seeds, library)
             write_json(kept, [[*each, error] for each, error in tried.items()])
         shown.update()
         shown.set_postfix_str(f"error {min(tried.values()):.1f}")
@@ -195,17 +189,15 @@ def fit_parameters(
 
 
 def filter_error(
-    cell: Cell, parameters: ARZParameters, seeds: Sequence[int], place: Place
+    cell: Cell, parameters: ARZParameters, seeds: Sequence[int], library: RecordLibrary
 ) -> float:
-    """Return the mean error x 1000 of a filter with given parameters."""
+    """Return the mean error x 1000 of a filter with given parameters.
+
+    All episodes are one batch: the steps of a batch take little longer than those of an episode.
+    """
     keywords = {**cell.keywords, "parameters": dataclasses.asdict(parameters)}
-    cell = dataclasses.replace(cell, keywords=keywords)
-    n = min(getattr(place.executor, "workers", 1), len(seeds))
-    parts: list[Sequence[int]] = [seeds[first::n] for first in range(n)]
-    work: Callable[[Any], list[Row]] = partial(play, cell, records=place.records)
-    with quietly():
-        rows = run_in_order(place.executor, work, parts, progress=False)
-    return float(np.mean([-1000.0 * row["reward"] for part in rows for row in part]))
+    rows = play(dataclasses.replace(cell, keywords=keywords, watchers=()), seeds, library)
+    return float(np.mean([-1000.0 * row["reward"] for row in rows]))
 
 
 def _rounded(values: FloatArray) -> list[float]:

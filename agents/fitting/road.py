@@ -27,6 +27,7 @@ from dptse_env.config import (
 from dptse_env.evaluation import WARM_UP
 from dptse_env.model import available_parameters
 from dptse_env.model.parameters import LARGEST_W, SECONDS_PER_HOUR
+from dptse_env.release import RELEASE_MODELS
 from dptse_env.traffic import (
     Corridor,
     RecordLibrary,
@@ -175,9 +176,12 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
     if "bandwidth" not in keywords:
         keywords["bandwidth"] = min(base.bandwidth, max(corridor.n_mainline // 3, 1))
         decided.append("bandwidth")
-        remarks.append(f"bandwidth {keywords['bandwidth']}: at most a third of the segments a second")
+        remarks.append(
+            f"bandwidth {keywords['bandwidth']}: at most a third of the segments a second"
+        )
     is_field = corridor.recordings is not None and not has_vehicles(corridor.recordings)
-    if is_field and "privacy" not in keywords and base.privacy.preset != "paper":
+    needs_vehicles = RELEASE_MODELS.find(base.privacy.preset).needs_vehicles
+    if is_field and needs_vehicles and "privacy" not in keywords:
         keywords["privacy"] = "corrected"
         decided.append("privacy")
         remarks.append("release model 'corrected', since a measured field has no vehicles")

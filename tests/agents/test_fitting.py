@@ -1,6 +1,5 @@
 """A road is fitted: what is searched, what is chosen, and what its file says afterwards."""
 
-import dataclasses
 import json
 import tomllib
 import warnings
@@ -21,7 +20,7 @@ from agents.fitting.road_file import copy_of, write_choice
 from agents.play import Cell
 from agents.study import Place
 from dptse_env.model import load_parameters
-from dptse_env.traffic import read_road
+from dptse_env.traffic import RecordLibrary, read_road
 from tests.scripts.commands import refused, run_command
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
@@ -112,17 +111,17 @@ def test_the_same_command_plays_nothing_again_and_changes_no_file_of_yours(fitte
 
 
 def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
-    corridor, cell, place = search_of(tmp_path)
+    corridor, cell, library = search_of(tmp_path)
     tried = []
 
-    def error(cell, parameters, seeds, place):
+    def error(cell, parameters, seeds, library):
         if len(tried) == 7:
             raise KeyboardInterrupt
         tried.append(parameters)
         return bowl(parameters)
 
     kept, start = tmp_path / "search.json", start_from(load_parameters("paper"), corridor, "mine")
-    arguments = corridor, cell, (0,), start, 100.0, place, 60, kept
+    arguments = corridor, cell, (0,), start, 100.0, library, 60, kept
     monkeypatch.setattr(searching, "filter_error", error)
     with pytest.raises(KeyboardInterrupt):
         fit_parameters(*arguments)
@@ -147,18 +146,18 @@ def bowl(parameters, v_f=95.0, gamma=0.8):
 def search_of(folder):
     path = folder / "my-road.toml"
     path.write_text(ROAD)
-    return read_road(path).corridor, Cell(ID), Place(folder, THIS_PROCESS)
+    return read_road(path).corridor, Cell(ID), RecordLibrary(folder)
 
 
 def test_the_search_finds_the_least_error_and_says_where_it_ended_at_a_bound(tmp_path, monkeypatch):
-    corridor, cell, place = search_of(tmp_path)
+    corridor, cell, library = search_of(tmp_path)
     start = start_from(load_parameters("w99-3lane"), corridor, "mine")
     assert (start.lanes, start.derived_from) == (2, "w99-3lane")
 
     def fit(error, name):
         monkeypatch.setattr(searching, "filter_error", lambda *given: error(given[1]))
         kept = tmp_path / name
-        return fit_parameters(corridor, cell, (0,), start, 100.0, place, 100, kept)
+        return fit_parameters(corridor, cell, (0,), start, 100.0, library, 100, kept)
 
     inside = fit(bowl, "inside.json")
     assert inside.parameters.free_flow_speed == pytest.approx(95.0, rel=0.05)
@@ -195,7 +194,9 @@ def test_a_choice_changes_for_what_is_certainly_better(errors, chosen, tmp_path,
     choice = Choice(road, tmp_path, {"w99-3lane": {}}, parameters="w99-3lane")
     monkeypatch.setattr(choosing.Choice, "play", lambda self, wanted, place: wanted)
     monkeypatch.setattr(
-        choosing, "values", lambda rows, labels, metric: np.array(errors[labels["estimator"]], float)
+        choosing,
+        "values",
+        lambda rows, labels, metric: np.array(errors[labels["estimator"]], float),
     )
     choice.choose([{"estimator": name} for name in errors], Place(tmp_path, THIS_PROCESS))
     assert (choice.estimator, choice.rule) == (chosen, "round-robin")
