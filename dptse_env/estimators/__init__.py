@@ -7,6 +7,7 @@ import numpy as np
 
 from dptse_env.estimators.base import Backend, BatchEstimator, Estimate, Estimator, Measurement
 from dptse_env.estimators.settings import (
+    AdaptiveSmoothingSettings,
     BlendSettings,
     DemandSettings,
     EnsembleSettings,
@@ -24,6 +25,7 @@ __all__ = [
     "BACKENDS",
     "ESTIMATORS",
     "REFERENCES",
+    "AdaptiveSmoothingSettings",
     "BatchEstimator",
     "BlendSettings",
     "DemandSettings",
@@ -61,6 +63,7 @@ ESTIMATORS = Registry(
         "blend": "dptse_env.estimators.simple:Blend",
         "open_loop": "dptse_env.estimators.simple:OpenLoop",
         "recurrent": "dptse_env.estimators.recurrent:Recurrent",
+        "asm": "dptse_env.estimators.asm:AdaptiveSmoothing",
     },
     check=_expected,
 )
