@@ -242,6 +242,7 @@ LABELS = {
     "random_walk": "random walk",
     "blend": "EKF and random walk",
     "recurrent": "recurrent",
+    "asm": "adaptive smoothing",
     "open_loop": "open loop",
 }
 """Names of the estimators in figures and tables."""

@@ -13,7 +13,7 @@ traffic, m = (1 + tanh((V - v) / dV)) / 2 with v = min(v_free, v_jam):
     z(x) = m z_jam(x) + (1 - m) z_free(x)
 
 Densities are smoothed per lane, along the mainline and along each ramp for itself: smoothed into
-each other, errors of the mainline are a fifth to a half larger. A released flow becomes a speed,
+each other, errors of the mainline are up to a half larger. A released flow becomes a speed,
 centre + flow / density, by the density estimated before it. Neighbours further away than `REACH` s
 are left out. What the model's inputs say of the ends of the road are values as well, half a segment
 beyond it: behind an exit drivers keep their w = v + p(rho). The prior is a value of second 0.
