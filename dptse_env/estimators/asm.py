@@ -14,9 +14,10 @@ traffic, m = (1 + tanh((V - v) / dV)) / 2 with v = min(v_free, v_jam):
 
 Densities are smoothed per lane, along the mainline and along each ramp for itself: smoothed into
 each other, errors of the mainline are up to a half larger. A released flow becomes a speed,
-centre + flow / density, by the density estimated before it. Neighbours further away than `REACH` s
-are left out. What the model's inputs say of the ends of the road are values as well, half a segment
-beyond it: behind an exit drivers keep their w = v + p(rho). The prior is a value of second 0.
+centre + flow / density, by the density estimated before it; where that is below `LEAST_DENSITY`,
+vehicles at the speed limit are added up to it. Neighbours further away than `REACH` s are left out.
+What the model's inputs say of the ends of the road are values as well, half a segment beyond it:
+behind an exit drivers keep their w = v + p(rho). The prior is a value of second 0.
 
 Sums over all seconds take no history of releases. With the decay r = exp(-1 / tau) of a step and
 P_t = r P_{t-1} + z_t, the sum of a place over the seconds of all ages a with a wave that takes L to
@@ -34,8 +35,8 @@ what the mean smooths away, in the variance
 
 With n = rho l vehicles in a segment, their number flickers less than that of a Poisson process, and
 their mean speed the less the more they are. The coefficients are fitted to training traffic of the
-package's roads. The factors k of a segment
-follow its innovations e, of variance noise + k M, in a memory that fades:
+package's roads. The factors k of a segment follow its innovations e, of variance noise + k M, in a
+memory that fades:
 
     k = (K + sum M (e^2 - noise) / (noise + M)^2) / (K + sum M^2 / (noise + M)^2)
 
@@ -62,7 +63,7 @@ from dptse_env.utils.kernels import Bundle, all_finite, kernel, kernel_part
 REACH = 3.0
 """Distance of the furthest neighbours, in s: they weigh a twentieth of the place itself."""
 LEAST_DENSITY = 15.0
-"""Density of a lane [veh/km] below which a flow is divided by it: mostly noise."""
+"""Density of a lane [veh/km] below which a flow is mostly noise."""
 LEAST_WEIGHT = 1e-100
 FREE, JAM = 0, 1
 WEIGHT, DENSITY, SPEED, DENSITY_NOISE, SPEED_NOISE = range(5)
@@ -87,6 +88,7 @@ class Stencil(NamedTuple):
     lanes: FloatArray  # (S,)
     jam: FloatArray  # (S,) largest densities [veh/km]
     lengths: FloatArray  # (S,) [km]
+    limits: FloatArray  # (S,) speed limits [km/h]
     row_first: IntArray  # (M,) first segment of each row of a measurement
     row_span: IntArray  # (M,) segments of each row
     flows: bool  # whether flows are released, otherwise speeds
@@ -222,6 +224,7 @@ def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stenci
         lanes=layout.lanes,
         jam=model.jam_density,
         lengths=layout.lengths,
+        limits=np.array(model.network.speed_limits),
         row_first=model.rows.first,
         row_span=model.rows.span,
         flows=model.reference_speed is not None,
@@ -521,7 +524,7 @@ def _read_row(
         by_speed, slip = 1.0, 0.0
         if stencil.flows:
             by_speed, slip = floored, speed - centre[s]
-            carried += share * floored * centre[s]
+            carried += share * (density * centre[s] + (floored - density) * stencil.limits[s])
         y += share * (density * slip if stencil.flows else speed)
         y_variance += share**2 * ((by_speed * present[s, 3]) ** 2 + (slip * present[s, 2]) ** 2)
         y_smoothed += share**2 * by_speed**2 * state.smoothed[e, s, 1]

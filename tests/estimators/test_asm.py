@@ -141,7 +141,10 @@ class Textbook:
             slip = speed - centre if flows else np.zeros(len(speed))
             by_speed = floored if flows else np.ones(len(speed))
             y = H @ (density * slip) if flows else H @ speed
-            v = (values[m, 1] + H @ (floored * centre)) / (H @ floored) if flows else values[m, 1]
+            v = values[m, 1]
+            if flows:
+                added = (floored - density) * model.network.speed_limits
+                v = (v + H @ (density * centre + added)) / (H @ floored)
             z = np.array([values[m, 0] / (H @ lanes), v])
             noise = np.array([sigma[m, 0] / (H @ lanes), sigma[m, 1] / (H @ by_speed)]) ** 2
             errors = values[m] - [H @ density, y]
