@@ -64,7 +64,7 @@ def find_study(args: Args) -> Study:
     """
     for argument, name in (("policies", "policies"), ("weights", "roads")):
         if getattr(args, argument) and args.name != name:
-            raise ValueError(f"{argument} are for the study {name}, not for {args.name!r}")
+            raise ValueError(f"{argument} are arguments of the study {name}, not of {args.name!r}")
     if args.policies:
         from agents.studies.policies import study as with_policies  # noqa: PLC0415
 

@@ -34,7 +34,6 @@ from agents.tables import (
     UnmeasuredError,
     below,
     cell,
-    format_range,
     give_or_take,
     grid,
     mean,
@@ -88,7 +87,12 @@ OTHERS: dict[str, Road] = {
 """Beside the own roads: recorded ones, and those that networks are trained on."""
 OWN = {name: Road(PRIVATE, [(keywords, SEEDS)]) for name, keywords in OWN_ROADS.items()}
 ROADS = {**OWN, **OTHERS}
-LINES = [(name, release) for name, road in ROADS.items() for release in road.releases]
+
+
+def lines() -> list[tuple[str, str]]:
+    """Return each road with each of its release models."""
+    shown = (name for name in ROADS if OPENED or name not in KEPT_BACK)
+    return [(name, release) for name in shown for release in ROADS[name].releases]
 
 
 def on_road(road: str, release: str, estimator: str, network: str = "") -> Labels:
@@ -131,17 +135,16 @@ def study(weights: Sequence[str] = (SHIPPED,)) -> Study:
         FileNotFoundError: A file is missing.
     """
     who = [*((name, "") for name in FILTERS), *((NETWORK, each) for each in weights)]
-    lines = [line for line in LINES if OPENED or line[0] not in KEPT_BACK]
-    cells = [each for line, own in product(lines, who) for each in road_cells(*line, *own)]
+    cells = [each for line, own in product(lines(), who) for each in road_cells(*line, *own)]
     return Study("roads", tuple(cells), SEEDS, report)
 
 
 # ---- Tables and a figure. ----
 
-NOTES = f"""Errors are minus the reward after the warm-up, x 1000, on traffic seeds
-{format_range(SEEDS)}, with 95 % intervals. *Best filter*: the one with the smallest mean error;
-differences from it are paired. *χ²*: mean square of errors over reported deviations, of densities
-and of speeds. Nothing was chosen on roads with an asterisk: they were played once, at the end."""
+NOTES = f"""Errors are minus the reward after the warm-up, x 1000, on {len(SEEDS)} test seeds or
+more, with 95 % intervals. *Best filter*: the one with the smallest mean error; differences from it
+are paired. *χ²*: mean square of errors over reported deviations, of densities and of speeds.
+Nothing was chosen on roads with an asterisk: they were played once, at the end."""
 
 
 def best_filter(rows: pl.DataFrame, road: str, release: str) -> str:
@@ -177,29 +180,27 @@ def chi2(rows: pl.DataFrame, labels: Labels) -> list[float]:
 def network_table(rows: pl.DataFrame, network: str) -> str:
     """Return the table of a network beside the filters."""
 
-    def error(estimator: str, road: str, release: str) -> str:
-        labels = on_road(road, release, estimator, network if estimator == NETWORK else "")
-        return give_or_take(mean(rows, labels, ERROR))
+    def of(estimator: str, line: tuple[str, str]) -> Labels:
+        return on_road(*line, estimator, network if estimator == NETWORK else "")
 
-    def honesty(estimator: str, road: str, release: str) -> str:
-        labels = on_road(road, release, estimator, network if estimator == NETWORK else "")
-        return ", ".join(f"{each:.2f}" for each in chi2(rows, labels))
+    def error(estimator: str, line: tuple[str, str]) -> str:
+        return give_or_take(mean(rows, of(estimator, line), ERROR))
 
-    def density_ratio(road: str, release: str) -> str:
-        own, ekf = on_road(road, release, NETWORK, network), on_road(road, release, "ekf")
-        return f"{mean(rows, own, DENSITY).mean / mean(rows, ekf, DENSITY).mean:.2f}"
+    def honesty(estimator: str, line: tuple[str, str]) -> str:
+        return ", ".join(f"{each:.2f}" for each in chi2(rows, of(estimator, line)))
 
-    everyone = (*FILTERS, NETWORK)
-    columns: dict[str, Callable[[str, str], str]] = {
-        **{LABELS[name]: partial(error, name) for name in everyone},
-        "below best filter [%]": lambda *line: tenths(gain(rows, network, *line)),
-        **{f"χ², {LABELS[name]}": partial(honesty, name) for name in everyone},
+    def density_ratio(line: tuple[str, str]) -> str:
+        own, ekf = (mean(rows, of(each, line), DENSITY).mean for each in (NETWORK, "ekf"))
+        return f"{own / ekf:.2f}"
+
+    columns: dict[str, Callable[[tuple[str, str]], str]] = {
+        **{LABELS[name]: partial(error, name) for name in (*FILTERS, NETWORK)},
+        "below best filter [%]": lambda line: tenths(gain(rows, network, *line)),
+        **{f"χ² of {LABELS[name]}": partial(honesty, name) for name in (FILTERS[-1], NETWORK)},
         "density RMSE over EKF's": density_ratio,
     }
-    lines = {
-        f"{road}{'*' * (road in KEPT_BACK)}, {release}": (road, release) for road, release in LINES
-    }
-    return grid("", list(lines), list(columns), lambda name, head: columns[head](*lines[name]))
+    heads = {f"{line[0]}{'*' * (line[0] in KEPT_BACK)}, {line[1]}": line for line in lines()}
+    return grid("", list(heads), list(columns), lambda name, head: columns[head](heads[name]))
 
 
 def summary(rows: pl.DataFrame, network: str) -> str:
@@ -229,7 +230,7 @@ def summary(rows: pl.DataFrame, network: str) -> str:
 def draw_gains(rows: pl.DataFrame) -> Figure:
     """Draw by how much the network of the package errs less than the best filter of each road."""
     label = "error below that of the best filter [%]"
-    names = [road for road in ROADS if OPENED or road not in KEPT_BACK]
+    names = list(dict.fromkeys(road for road, _ in lines()))
     series = {
         release: {
             road: {label: gain(rows, SHIPPED, road, release)}

@@ -64,16 +64,16 @@ def simulate(seed: int) -> Record:
             wish = LIMIT / 3.6 * rng.normal(1.0, 0.08)
             start = min(wish, speed + 1.0)
             if place > VEHICLE + GAP + start:
-                new = 0.0, start, wish, rng.uniform(0.8, 1.5), lane, n_cars
+                new = np.array([0.0, start, wish, rng.uniform(0.8, 1.5), lane, n_cars])
                 cars = np.column_stack([cars, new])
                 n_cars, waiting[lane] = n_cars + 1, waiting[lane] - 1
         cars = _in_order(cars)
         for i in np.flatnonzero(rng.random(cars.shape[1]) < CHANGE * STEP):
-            _look_for_room(cars, i, int(rng.choice([-1, 1])))
+            _look_for_room(cars, int(i), int(rng.choice([-1, 1])))
         cars = _in_order(cars)
         if t >= WARM_UP and t % 1.0 == 0.0:
             seen.append(_seen(cars, int(t) - WARM_UP))
-        _drive(cars, factor, rng)
+        drive(cars, factor, rng)
         cars = cars[:, cars[0] < LENGTH]
     step, vehicle, segment, speed = np.concatenate(seen, axis=1)
     return Record(
@@ -107,7 +107,7 @@ def _look_for_room(cars: FloatArray, i: int, side: int) -> None:
         cars[4, i] = lane + side
 
 
-def _drive(cars: FloatArray, factor: float, rng: np.random.Generator) -> None:
+def drive(cars: FloatArray, factor: float, rng: np.random.Generator) -> None:
     """Move cars for a step, by the intelligent driver model with noise."""
     place, speed, wish, headway = cars[:4]
     gap, slower = _gaps(cars)
