@@ -50,8 +50,8 @@ class Args(Machines):
     policies: tuple[str, ...] = ()
     """Trained policies for the study of policies, each name=path."""
     weights: tuple[str, ...] = ()
-    """Networks for the study of roads in place of the shipped one, each a name, or a path without
-    "-flows.safetensors" and "-speeds.safetensors"; needs another output."""
+    """Networks for the study of roads, in place of the shipped one, or of estimators, beside it:
+    names, or paths without "-flows.safetensors" and "-speeds.safetensors"; need another output."""
     output: Path | None = None
     """Folder of the results; results/NAME if not given, with "-quick" for quick ones."""
 
@@ -62,17 +62,17 @@ def find_study(args: Args) -> Study:
     Raises:
         ValueError: There is no such study, or an argument is of another one.
     """
-    for argument, name in (("policies", "policies"), ("weights", "roads")):
-        if getattr(args, argument) and args.name != name:
-            raise ValueError(f"{argument} are arguments of the study {name}, not of {args.name!r}")
+    for argument, names in (("policies", ("policies",)), ("weights", ("estimators", "roads"))):
+        if getattr(args, argument) and args.name not in names:
+            raise ValueError(
+                f"{argument} are arguments of the study {' or '.join(names)}, not of {args.name!r}"
+            )
     if args.policies:
         from agents.studies.policies import study as with_policies  # noqa: PLC0415
 
         found = with_policies(args.policies)
     elif args.weights:
-        from agents.studies.roads import study as with_networks  # noqa: PLC0415
-
-        found = with_networks(args.weights)
+        found = importlib.import_module(f"agents.studies.{args.name}").study(args.weights)
     elif args.name in STUDIES:
         found = importlib.import_module(f"agents.studies.{args.name}").STUDY
     elif ":" in args.name:

@@ -34,7 +34,7 @@ def test_every_study_is_found_and_a_cell_has_one_set_of_labels(name):
         ({"name": "no_such_module:STUDY"}, "'no_such_module:STUDY' cannot be imported"),
         ({"name": "examples.my_study:CELLS"}, "must be a Study, got tuple"),
         ({"name": MINE, "policies": ("a=b.zip",)}, "policies are arguments of the study policies"),
-        ({"name": "paper", "weights": ("a",)}, "weights are arguments of the study roads, not of"),
+        ({"name": "paper", "weights": ("a",)}, "weights are arguments of the study estim"),
         ({"name": MINE, "seeds": "all"}, "must be 'first:stop' or one seed, got 'all'"),
         ({"name": MINE, "workers": 0}, "workers must be an integer >= 1"),
     ],

@@ -51,8 +51,6 @@ SEEDS, MORE_SEEDS = tuple(range(2000, 2008)), tuple(range(2000, 2016))
 FILTERS, NETWORK = ("ekf", "blend"), "recurrent"
 SHIPPED = "highway"
 """The network of the package."""
-FLOWS = ("capped", "paced")
-"""Release models that release flows."""
 PACED, CORRECTED = "paced", "corrected"
 RELEASES: dict[str, dict[str, Any]] = {
     PACED: {"privacy": PACED, "epsilon": 5.0},
@@ -116,8 +114,7 @@ def road_cells(road: str, release: str, estimator: str, weights: str = "") -> li
     """Return the cells of an estimator on a road."""
     more: dict[str, Any] = {"estimator": estimator}
     if weights:
-        own = weights if named(weights) == weights else member_for(weights, release in FLOWS)
-        more["estimator_settings"] = {"recurrent": {"weights": own, "outside": True}}
+        more["estimator_settings"] = {"recurrent": {"weights": weights, "outside": True}}
     labels = on_road(road, release, estimator, weights and named(weights))
     return [
         Cell(
