@@ -107,6 +107,7 @@ def world_cell(
     world: str,
     estimator: str,
     policy: str = ROUND_ROBIN,
+    *,
     network: int = 0,
     weights: str = "highway",
 ) -> Cell:
