@@ -98,16 +98,29 @@ def on_road(road: str, release: str, estimator: str, network: str = "") -> Label
     return {"road": road, "release": release, "estimator": estimator, "network": network}
 
 
+def member(weights: str, release: str) -> str | None:
+    """Return the network of a pair that suits a release model; None where it is missing."""
+    found = member_for(weights, flows=release == PACED)
+    return found if found in shipped_networks() or Path(found).is_file() else None
+
+
 def named(weights: str) -> str:
-    """Return the name of a network in tables: its own, and for files that with a digest of both.
+    """Return the name of a network in tables: its own, and for files that with a digest of them.
 
     Raises:
-        FileNotFoundError: One of a pair of files is missing.
+        FileNotFoundError: There is no such network.
     """
-    if member_for(weights, flows=True) in shipped_networks():
+    members = sorted({found for each in RELEASES if (found := member(weights, each))})
+    if not members:
+        raise FileNotFoundError(
+            f"weights must be a network of the package, a file, or what the files "
+            f"<weights>-flows.safetensors and <weights>-speeds.safetensors begin with, "
+            f"got {weights!r}"
+        )
+    if members[0] in shipped_networks():
         return weights
-    pair = "".join(file_digest(member_for(weights, flows)) for flows in (True, False))
-    return f"{Path(weights).name} {hashlib.sha256(pair.encode()).hexdigest()[:6]}"
+    digest = hashlib.sha256("".join(map(file_digest, members)).encode()).hexdigest()
+    return f"{Path(weights).name} {digest[:6]}"
 
 
 def road_cells(road: str, release: str, estimator: str, weights: str = "") -> list[Cell]:
@@ -115,7 +128,7 @@ def road_cells(road: str, release: str, estimator: str, weights: str = "") -> li
     more: dict[str, Any] = {"estimator": estimator}
     if weights:
         more["estimator_settings"] = {"recurrent": {"weights": weights, "outside": True}}
-    labels = on_road(road, release, estimator, weights and named(weights))
+    labels = on_road(road, release, estimator, named(weights) if weights else "")
     return [
         Cell(
             ROADS[road].env, "round-robin", {**keywords, **RELEASES[release], **more}, labels,
@@ -126,13 +139,20 @@ def road_cells(road: str, release: str, estimator: str, weights: str = "") -> li
 
 
 def study(weights: Sequence[str] = (SHIPPED,)) -> Study:
-    """Return the study with some networks, each a name or what the files of a pair have in common.
+    """Return the study with some networks, each a name or what the files of a pair begin with.
+
+    One of a pair is played where it suits.
 
     Raises:
-        FileNotFoundError: A file is missing.
+        FileNotFoundError: There is no such network.
     """
     who = [*((name, "") for name in FILTERS), *((NETWORK, each) for each in weights)]
-    cells = [each for line, own in product(lines(), who) for each in road_cells(*line, *own)]
+    cells = [
+        each
+        for (road, release), (estimator, own) in product(lines(), who)
+        if not own or member(own, release)
+        for each in road_cells(road, release, estimator, own)
+    ]
     return Study("roads", tuple(cells), SEEDS, report)
 
 

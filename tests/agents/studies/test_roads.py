@@ -60,7 +60,10 @@ def test_a_network_in_files_has_cells_of_its_own_which_follow_its_weights(tmp_pa
     changed = {cell.id for cell in roads.study([str(prefix)]).cells}
     assert changed & set(first) == set(first) & set(shipped)
     Path(f"{prefix}-speeds.safetensors").unlink()
-    with pytest.raises(FileNotFoundError, match="mine"):
+    cells = roads.study([str(prefix)]).cells
+    assert {each.labels["release"] for each in cells if each.labels["network"]} == {"paced"}
+    Path(f"{prefix}-flows.safetensors").unlink()
+    with pytest.raises(FileNotFoundError, match=r"weights must be .*mine"):
         roads.study([str(prefix)])
 
 
