@@ -123,12 +123,14 @@ def named(weights: str) -> str:
     return f"{Path(weights).name} {digest[:6]}"
 
 
-def road_cells(road: str, release: str, estimator: str, weights: str = "") -> list[Cell]:
-    """Return the cells of an estimator on a road."""
+def road_cells(
+    road: str, release: str, estimator: str, weights: str = "", network: str = ""
+) -> list[Cell]:
+    """Return the cells of an estimator on a road, a network with its weights and its name."""
     more: dict[str, Any] = {"estimator": estimator}
     if weights:
         more["estimator_settings"] = {"recurrent": {"weights": weights, "outside": True}}
-    labels = on_road(road, release, estimator, named(weights) if weights else "")
+    labels = on_road(road, release, estimator, network)
     return [
         Cell(
             ROADS[road].env, "round-robin", {**keywords, **RELEASES[release], **more}, labels,
@@ -146,12 +148,12 @@ def study(weights: Sequence[str] = (SHIPPED,)) -> Study:
     Raises:
         FileNotFoundError: There is no such network.
     """
-    who = [*((name, "") for name in FILTERS), *((NETWORK, each) for each in weights)]
+    who = [*((name, "", "") for name in FILTERS), *((NETWORK, w, named(w)) for w in weights)]
     cells = [
         each
-        for (road, release), (estimator, own) in product(lines(), who)
+        for (road, release), (estimator, own, name) in product(lines(), who)
         if not own or member(own, release)
-        for each in road_cells(road, release, estimator, own)
+        for each in road_cells(road, release, estimator, own, name)
     ]
     return Study("roads", tuple(cells), SEEDS, report)
 
