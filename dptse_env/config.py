@@ -486,6 +486,11 @@ def _inherited(
     is_other = is_other_road or tuned_with(parameters) != parameters.name
     if is_other and config.settings_name is not None and "estimator_settings" not in given:
         found.append("estimator_settings")
+    inherits = getattr(ESTIMATORS.find(config.estimator), "inherits", None)
+    if inherits is not None:
+        centre = RELEASE_MODELS.find(config.privacy.preset).flow_centre(corridor, config.privacy)
+        spans = max(config.query_spans)
+        found += inherits(corridor, centre is not None, spans, config.settings())
     return tuple(found)
 
 

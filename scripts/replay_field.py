@@ -67,8 +67,6 @@ class Args:
         settings: Any = self.settings or {}
         if isinstance(settings, str) and settings.lstrip().startswith("{"):
             settings = parse_json(settings, "settings")
-        if isinstance(settings, dict):
-            settings = {"recurrent": {"weights": "highway", "outside": True}} | settings
         return {
             "parameters": self.parameters,
             "estimator_settings": settings,
