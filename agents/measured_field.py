@@ -1,23 +1,26 @@
 """Replay of a measured field of density and speed as the truth, for estimators alone.
 
-A field has no vehicles. What a release would say is the field itself plus the noise of the preset
-``corrected``, whose deviation needs the road alone; the segments at both ends are the boundary.
+A field has no vehicles. What a release would say is the field itself plus the noise of a release
+model whose deviation needs the road alone, as ``corrected``; the segments at both ends are the
+boundary.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
+from dptse_env.config import EnvConfig
 from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.evaluation import WARM_UP
 from dptse_env.importers.fields import FieldSource, by_second
-from dptse_env.model import ARZModel, ARZParameters
-from dptse_env.privacy import paper_sensitivity, single_noise_std
+from dptse_env.parts import make_model, make_release
 from dptse_env.traffic import Corridor, Demand
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.fields import require
 
 
 class Field(NamedTuple):
@@ -92,56 +95,56 @@ class Replay:
 
     Attributes:
         field: The field.
-        corridor: Its road.
-        parameters: Parameters of the filters' model.
-        bandwidth: Segments a second.
-        epsilon: Of the preset ``corrected``.
-        delta: The same.
+        config: Road, noise, bandwidth, estimator and its settings.
         window: Seconds of a window.
         n_repeats: Draws of the noise.
     """
 
     field: Field
-    corridor: Corridor
-    parameters: ARZParameters
-    bandwidth: int
-    epsilon: float = 1.0
-    delta: float = 0.05
+    config: EnvConfig
     window: int = 450
     n_repeats: int = 8
 
-    @property
+    @cached_property
     def sigma(self) -> FloatArray:
-        """Deviations of the noise of densities [veh/km] and speeds [km/h]."""
-        corridor = self.corridor
-        sensitivity = paper_sensitivity(
-            n_sensors=self.bandwidth,
-            average_dwell=corridor.average_dwell,
-            segment_length=self.field.segment_length,
-            free_flow_speed=corridor.speed_scale,
-            jam_density=corridor.density_scale,
-        )
-        return np.array(single_noise_std(sensitivity, self.epsilon, self.delta))
+        """Deviations of the noise of densities [veh/km] and speeds [km/h].
 
-    def run(self, estimator: str, settings: Any) -> FieldScore:
-        """Return the errors of an estimator; the noise is the same for all."""
-        field, corridor, rng = self.field, self.corridor, np.random.default_rng(0)
+        Raises:
+            ValueError: The release model needs vehicles, or not all of them are connected.
+        """
+        preset = self.config.privacy.preset
+        release = make_release(self.config)
+        blind = "one that needs no vehicles, as 'corrected'"
+        require(not release.needs_vehicles, "privacy.preset", blind, preset)
+        whole = "1, and detectors left out"
+        share = self.config.penetration.share
+        require(not self.config.has_separate_sensors, "penetration.share", whole, share)
+        return release.sigma
+
+    def run(self) -> FieldScore:
+        """Return the errors of the estimator; the noise is the same for all.
+
+        Raises:
+            ValueError: The estimator refuses the road, or see `sigma`.
+        """
+        field, config, rng = self.field, self.config, np.random.default_rng(0)
+        corridor, bandwidth, sigma = config.corridor, config.bandwidth, self.sigma
         starts = np.arange(0, len(field.density) - self.window, self.window)
         starts = np.repeat(starts, self.n_repeats)
         times = starts[:, None] + np.arange(self.window + 1)
         truth = np.stack([field.density, field.speed], axis=-1)[times]
         k, n, everyone = len(starts), corridor.n_mainline, np.arange(len(starts))
-        model = ARZModel(corridor, self.parameters)
-        made = make_estimator(estimator, "compiled", model, k, settings)
+        model = make_model(config)
+        made = make_estimator(config.estimator, config.backend, model, k, config.settings())
         lanes, limits = (np.array(of) for of in (corridor.segment_lanes, corridor.speed_limits))
         start = np.tile(25.0 * lanes, (k, 1)), np.tile(0.5 * limits, (k, 1))
         made.reset(everyone, model.states(*start), rng.spawn(k))
-        sigma, squares, ratios = self.sigma, [], []
+        squares, ratios = [], []
         for t in range(1, self.window + 1):
             ends = truth[:, t - 1, [0, -1]]
             made.predict(everyone, model.boundary_inputs(ends[..., 0], ends[..., 1]))
             observed = np.zeros((k, n), dtype=bool)
-            observed[:, (t * self.bandwidth + np.arange(self.bandwidth)) % n] = True
+            observed[:, (t * bandwidth + np.arange(bandwidth)) % n] = True
             now = truth[:, t, 1:-1]
             values = now + sigma * rng.normal(size=now.shape)
             made.update(everyone, Measurement.of(model, observed, values, sigma))

@@ -12,14 +12,20 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any
 
-from dptse_env.estimators import ESTIMATORS, check_estimator, checked_settings, settings_type
+from dptse_env.estimators import (
+    ESTIMATORS,
+    check_estimator,
+    check_settings,
+    checked_settings,
+    settings_type,
+)
 from dptse_env.estimators.settings import (
     read_settings,
     tuned_estimator,
     tuned_settings,
     tuned_with,
 )
-from dptse_env.model import ARZParameters, available_parameters, load_parameters
+from dptse_env.model import ARZModel, ARZParameters, available_parameters, load_parameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.release import (
     RELEASE_MODELS,
@@ -323,7 +329,7 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
             "or assumed, are used on another road or with other parameters; give them to use "
             "others",
             UserWarning,
-            stacklevel=3,
+            stacklevel=1,  # one place, so that Python tells it once, however environments are made
         )
     return config
 
@@ -341,6 +347,26 @@ def _of_file(
             said = str(problem).replace(OR_IMPORTED, "")
             return type(problem)(f"{overrides['corridor']}: {table}{said}")
     return problem
+
+
+def check_road(config: EnvConfig, model: ARZModel, overrides: Mapping[str, Any]) -> None:
+    """Refuse an estimator's settings on a road, and a road for an estimator.
+
+    Args:
+        config: What `resolve` made of the overrides.
+        model: Its traffic model.
+        overrides: The keywords.
+
+    Raises:
+        ValueError: As `dptse_env.estimators.check_settings`, with the road file in front where the
+            value that it names comes from it.
+    """
+    try:
+        check_settings(config.estimator, model, config.settings())
+    except ValueError as problem:
+        path = overrides.get("corridor")
+        road = read_road(path) if is_road_file(path) else None
+        raise _of_file(problem, overrides, road) from problem
 
 
 def _resolve(
@@ -460,6 +486,11 @@ def _inherited(
     is_other = is_other_road or tuned_with(parameters) != parameters.name
     if is_other and config.settings_name is not None and "estimator_settings" not in given:
         found.append("estimator_settings")
+    inherits = getattr(ESTIMATORS.find(config.estimator), "inherits", None)
+    if inherits is not None:
+        centre = RELEASE_MODELS.find(config.privacy.preset).flow_centre(corridor, config.privacy)
+        spans = max(config.query_spans)
+        found += inherits(corridor, centre is not None, spans, config.settings())
     return tuple(found)
 
 

@@ -8,9 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.config import resolve
 from dptse_env.env_base import QueryEnvBase
-from dptse_env.parts import warn_where_void
 from dptse_env.rendering import Drawing, Window
 from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Observation
@@ -209,8 +207,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
             UserWarning: A release model with a guarantee is configured, and other keywords void
                 it, or values of another road are used on this one.
         """
-        super().__init__(resolve(preset, overrides), 1, records, render_mode)
-        warn_where_void(self.config)
+        super().__init__(preset, overrides, 1, records, render_mode)
         self.action_space = self.interface.actions.space
         self.observation_space = self.interface.observations.space
         self.render_every = integer("render_every", render_every, 1)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.config import EnvConfig
-from dptse_env.estimators import check_settings
-from dptse_env.parts import make_interface, make_model, make_parts
+from dptse_env.config import check_road, resolve
+from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records, open_library
@@ -32,7 +32,8 @@ class QueryEnvBase:
 
     def __init__(
         self,
-        config: EnvConfig,
+        preset: str,
+        overrides: Mapping[str, Any],
         n_episodes: int,
         records: Records,
         render_mode: str | None,
@@ -42,20 +43,26 @@ class QueryEnvBase:
         """Describe the environment; nothing is recorded or compiled before the first reset.
 
         Raises:
-            ValueError: A part of another package, a setting of the estimator on this road, the
-                render mode or ``records`` is not what is expected.
+            ValueError: A keyword, a part of another package, a setting of the estimator on this
+                road, the render mode or ``records`` is not what is expected.
+
+        Warns:
+            UserWarning: As `resolve`; and a release model with a guarantee is configured, and other
+                keywords void it.
         """
+        config = resolve(preset, overrides)
         modes = self.metadata["render_modes"]
         allowed = " or ".join(["None", *map(repr, modes)])
         require(render_mode in (None, *modes), "render_mode", allowed, render_mode)
         self.config, self.render_mode = config, render_mode
         self.interface = make_interface(config)
         self._model = make_model(config)
-        check_settings(config.estimator, self._model, config.settings())
+        check_road(config, self._model, overrides)
         self._library, self._threads = open_library(records), threads
         self._n_episodes = n_episodes
         self._process: QueryProcess | None = None
         self.drawing: Drawing | None = None
+        warn_where_void(config)
 
     @property
     def process(self) -> QueryProcess:

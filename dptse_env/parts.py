@@ -189,10 +189,7 @@ def complete_report(
 
 
 def warn_where_void(config: EnvConfig) -> None:
-    """Warn where a release model that gives a guarantee was asked for, and other fields void it.
-
-    The warning names the line that called the caller, the constructor of an environment.
-    """
+    """Warn where a release model that gives a guarantee was asked for, and other fields void it."""
     if not RELEASE_MODELS.find(config.privacy.preset).claims_guarantee:
         return
     # Who asks for the truth in info knows that it is shown.
@@ -206,7 +203,7 @@ def warn_where_void(config: EnvConfig) -> None:
         warnings.warn(
             f"privacy.preset is {config.privacy.preset!r}, yet no privacy is guaranteed. {listed}",
             UserWarning,
-            stacklevel=3,
+            stacklevel=1,  # one place, so that Python tells it once, however environments are made
         )
 
 

@@ -14,9 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from dptse_env.config import resolve
 from dptse_env.env_base import QueryEnvBase
-from dptse_env.parts import warn_where_void
 from dptse_env.process import per_episode
 from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records
@@ -120,9 +118,7 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         """
         self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
         threads = None if threads is None else integer("threads", threads, 1, 1024)
-        config = resolve(preset, overrides)
-        super().__init__(config, self.num_envs, records, render_mode, threads=threads)
-        warn_where_void(config)
+        super().__init__(preset, overrides, self.num_envs, records, render_mode, threads=threads)
         self.render_episode = integer("render_episode", render_episode, 0, self.num_envs - 1)
         if render_mode is not None:
             self.drawing = Drawing(self.render_episode)

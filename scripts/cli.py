@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,7 +130,11 @@ def run(
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     config = (tyro.conf.FlagCreatePairsOff,)
     try:
-        main(tyro.cli(arguments, prog=program, args=words, description=description, config=config))
+        given = tyro.cli(
+            arguments, prog=program, args=words, description=description, config=config
+        )
+        with warnings_told_once():
+            main(given)
     except BrokenPipeError:  # the reader of a pipe has seen enough, as head does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(141) from None
@@ -138,6 +144,27 @@ def run(
     except KeyboardInterrupt:
         print("interrupted: the same command goes on from what is finished", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+@contextlib.contextmanager
+def warnings_told_once() -> Iterator[None]:
+    """Log every warning once, as a line.
+
+    Python's own record of what it has shown is forgotten whenever somebody changes a filter.
+    """
+    told, before = set(), warnings.showwarning
+
+    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
+        text = str(message)
+        if text not in told:
+            told.add(text)
+            logging.getLogger("dptse").warning("%s", text)
+
+    warnings.showwarning = tell
+    try:
+        yield
+    finally:
+        warnings.showwarning = before
 
 
 def _in_words(problem: BaseException) -> str:

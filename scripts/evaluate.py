@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
@@ -27,10 +28,11 @@ from agents.seeds import seed_kind
 from agents.statistics import Interval
 from agents.study import ROWS, TABLES, Study, read_rows
 from agents.study import run as run_study
-from agents.tables import DENSITY, ERROR, SPEED, difference, error_label, markdown, mean
+from agents.tables import DENSITY, ERROR, SPEED, difference, error_label, markdown, mean, values
 from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import parse_seeds
 from dptse_env.schedules import OBSERVATION_SCHEDULES
+from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import require
 from scripts.cli import Environment, Machines
 
@@ -99,6 +101,8 @@ def make_cells(args: Args) -> list[Cell]:
         ValueError: A keyword is out of range, or two policies have one name.
     """
     env, given = parse_env(args.env)
+    if args.estimators:  # the environment's own may refuse its road
+        given["estimator"] = args.estimators[0]
     config = make_config(env, given)
     policies = {name: name for name in (*args.schedules, args.reference)}
     for source in args.policies:
@@ -125,15 +129,46 @@ def make_cells(args: Args) -> list[Cell]:
 
 
 def score(rows: pl.DataFrame, cells: Sequence[Cell], reference: str) -> Scores:
-    """Return the scores of cells."""
+    """Return the scores of cells; an interval of one episode is its point, with ``n`` 1."""
+    is_one = rows["traffic_seed"].n_unique() == 1
+
+    def compare(own: Mapping[str, str], against: Mapping[str, str], metric: str) -> Interval:
+        if not is_one:
+            return difference(rows, own, against, metric)
+        return point(values(rows, own, metric) - values(rows, against, metric))
+
     scores: dict[str, list[Score]] = {}
     for cell in cells:
         own, against = cell.labels, {**cell.labels, "policy": reference}
-        means = {each: mean(rows, own, each) for each in METRICS}
-        differences = {each: difference(rows, own, against, each) for each in METRICS}
+        means = {
+            each: point(values(rows, own, each)) if is_one else mean(rows, own, each)
+            for each in METRICS
+        }
+        differences = {each: compare(own, against, each) for each in METRICS}
         found = scores.setdefault(own["estimator"], [])
         found.append(Score(own["policy"], means, differences))
     return {name: sorted(own, key=lambda s: s.means[ERROR].mean) for name, own in scores.items()}
+
+
+def point(values: FloatArray) -> Interval:
+    """Return a single value as an interval without length."""
+    (value,) = values.tolist()
+    return Interval(value, value, value, 1)
+
+
+def as_json(score: Score) -> dict[str, Any]:
+    """Return a score as plain JSON; ends of an interval are null where it has none."""
+    content = dataclasses.asdict(score)
+    for interval in (*content["means"].values(), *content["differences"].values()):
+        if interval["n"] == 1:
+            interval |= {"low": None, "high": None}
+    return content
+
+
+def in_words(interval: Interval, sign: str = "") -> str:
+    """Return a mean and half of its interval, if it has one."""
+    text = f"{interval.mean:{sign}.2f}"
+    return text if interval.n == 1 else f"{text} ± {interval.half_width:.2f}"
 
 
 def make_rows(scores: Sequence[Score], reference: str) -> tuple[list[str], list[list[str]]]:
@@ -143,15 +178,21 @@ def make_rows(scores: Sequence[Score], reference: str) -> tuple[list[str], list[
         header += [error_label(metric), f"against {reference}"]
         for row, each in zip(rows, scores, strict=True):
             own, less = each.means[metric], each.differences[metric]
-            row.append(f"{own.mean:.2f} ± {own.half_width:.2f}")
-            is_reference = each.policy == reference
-            row.append("-" if is_reference else f"{less.mean:+.2f} ± {less.half_width:.2f}")
+            row.append(in_words(own))
+            row.append("-" if each.policy == reference else in_words(less, "+"))
     return header, rows
+
+
+def legend(scores: Scores) -> str:
+    """Return what the numbers of the tables are."""
+    n = next(iter(scores.values()))[0].means[ERROR].n
+    several = "mean ± half of the 95 % interval"
+    return several if n > 1 else "one episode has no interval: differences may be chance"
 
 
 def write_markdown(title: str, scores: Scores, reference: str) -> str:
     """Return the tables as Markdown."""
-    parts = [f"# {title}", "Mean ± half of the 95 % interval."]
+    parts = [f"# {title}", f"{legend(scores).capitalize()}."]
     for estimator, own in scores.items():
         parts += [f"## Estimator `{estimator}`", markdown(*make_rows(own, reference))]
     return "\n\n".join(parts)
@@ -159,7 +200,7 @@ def write_markdown(title: str, scores: Scores, reference: str) -> str:
 
 def print_scores(title: str, scores: Scores, reference: str) -> None:
     """Print a table for each estimator."""
-    print_text(f"{title}; mean ± half of the 95 % interval")
+    print_text(f"{title}; {legend(scores)}")
     for estimator, own in scores.items():
         header, rows = make_rows(own, reference)
         folded = [each.replace(" [", "\n[").replace("against ", "against\n") for each in header]
@@ -199,14 +240,13 @@ def draw_traffic(args: Args, title: str, scores: Scores, cells: Sequence[Cell]) 
         write_page(args.output / PAGE, title, errors, episodes, seed)
 
 
-def make_title(args: Args, seeds: Sequence[int]) -> str:
-    """Return what is evaluated, in words."""
-    env, keywords = parse_env(args.env)
-    config = make_config(env, keywords)
+def make_title(cell: Cell, seeds: Sequence[int]) -> str:
+    """Return what is evaluated, in words, given one of the cells."""
+    config = make_config(cell.env, cell.keywords)
     noise = f"{config.privacy.preset} noise at ({config.privacy.epsilon:g}, "
     noise += f"{config.privacy.delta:g})"
-    traffic = f"{len(seeds)} episodes on {seed_kind(seeds)} traffic"
-    return f"{env.rpartition('/')[2]}, {config.arz_parameters.name}, {noise}, {traffic}"
+    traffic = f"{len(seeds)} episode{'s' * (len(seeds) > 1)} on {seed_kind(seeds)} traffic"
+    return f"{cell.env.rpartition('/')[2]}, {config.arz_parameters.name}, {noise}, {traffic}"
 
 
 def main(args: Args) -> None:
@@ -214,10 +254,9 @@ def main(args: Args) -> None:
     names = (ROWS, TABLES, ERRORS, MAPS, *([PAGE] if args.html else []))
     refuse_to_replace([args.output / name for name in names], args.force)
     cells, seeds = make_cells(args), parse_seeds(args.seeds)
-    require(len(seeds) >= 2, "seeds", "at least two, for an interval", args.seeds)
     for cell in cells:
         cell.check()
-    title, ids = make_title(args, seeds), {cell.id for cell in cells}
+    title, ids = make_title(cells[0], seeds), {cell.id for cell in cells}
 
     def summarise(rows: pl.DataFrame) -> Scores:
         # An interrupted evaluation may have left rows of other cells.
@@ -244,7 +283,7 @@ def main(args: Args) -> None:
     scores = summarise(read_rows("evaluation", args.output))
     if args.json:
         rows = [
-            {"estimator": estimator, **dataclasses.asdict(each)}
+            {"estimator": estimator, **as_json(each)}
             for estimator, own in scores.items()
             for each in own
         ]

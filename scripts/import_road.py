@@ -6,11 +6,13 @@ dptse import trajectories --help
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
@@ -28,10 +30,11 @@ from dptse_env.importers.network import (
     read_configuration,
 )
 from dptse_env.importers.report import REPORT
-from dptse_env.traffic import is_road_file, ranges, read_road, write_corridor
+from dptse_env.traffic import Corridor, is_road_file, ranges, read_road, write_corridor
 from dptse_env.utils.files import replacing
 from scripts.cli import Environment
 
+PAPER = "dptse_env:dptse/PaperHighway-v0"
 Shares = tuple[float, float, float]
 SHARES: Shares = (0.6, 0.2, 0.2)
 
@@ -74,8 +77,9 @@ class Trajectories(Environment):
     """Seconds left out between two windows."""
 
     def run(self) -> None:
-        """Import, and print which traffic seeds there are."""
-        road = parse_env(self.env)[1].get("corridor")
+        """Import, and print which traffic seeds there are and what to do next."""
+        env, keywords = parse_env(self.env)
+        road = keywords.get("corridor")
         environment = read_road(road).environment if is_road_file(road) else {}
         imported = import_trajectories(
             self.files,
@@ -86,8 +90,12 @@ class Trajectories(Environment):
             Options(self.longest_gap, self.skip_start, self.skip_end, self.pause),
             {key: value for key, value in environment.items() if key != "traffic_seeds"},
         )
+        for file in imported.report["files"]:
+            if file["recognised"]:
+                print(f"{file['file']}: recognised {file['recognised']}")
         print_seeds(imported.seeds)
         print(f"road: {self.output / ROAD}\nreport: {self.output / REPORT}")
+        print_next(self.output / ROAD, imported.seeds, imported.corridor, env, keywords)
 
     def source(self) -> Source:
         """Return what the data means: the mapping, changed by the other arguments."""
@@ -125,12 +133,15 @@ class Field:
     """Shares of the windows for training, validation and test, in this order of time."""
 
     def run(self) -> None:
-        """Import, and print which traffic seeds there are."""
+        """Import, and print which traffic seeds there are and what to do next."""
         corridor, seeds = import_field(
             self.source, self.road, self.output, splits(self.shares), self.duration
         )
         print_seeds(seeds)
         print(f"road: {self.output / ROAD}, segments of {corridor.segment_lengths[0]:g} km")
+        print_next(
+            self.output / ROAD, seeds, corridor, PAPER, {"privacy": "corrected"}, fit_for=PAPER
+        )
 
 
 @dataclass(frozen=True)
@@ -246,6 +257,35 @@ def print_seeds(seeds: Mapping[str, tuple[int, ...]]) -> None:
     """Print the traffic seeds of each part."""
     for name, given in seeds.items():
         print(f"{name}: {len(given)} window(s), traffic seeds {ranges(given)}")
+
+
+def print_next(
+    road: Path, seeds: Mapping[str, Sequence[int]], corridor: Corridor, env: str,
+    keywords: Mapping[str, Any], fit_for: str = "",
+) -> None:  # fmt: skip
+    """Print the commands that follow an import, with the traffic seeds that there are.
+
+    Args:
+        road: The road file.
+        seeds: Traffic seeds by part.
+        corridor: The road.
+        env: Id of an environment.
+        keywords: Its keywords.
+        fit_for: Id to fit the road for, if not the one that a fit has by default.
+    """
+    missing = [name for name, own in seeds.items() if not own]
+    if missing:
+        print(
+            f"note: there is no window for {' and '.join(missing)}, which fitting and evaluating "
+            f"need: a duration below {corridor.duration} s, more files or other shares make some"
+        )
+        return
+    given = {"bandwidth": min(2, corridor.n_mainline), **keywords, "corridor": road.as_posix()}
+    first, last = seeds["test"][0], seeds["test"][-1]
+    fit = "fit", road.as_posix(), *(("--env", fit_for) if fit_for else ())
+    evaluate = "evaluate", "--env", f"{env} {json.dumps(given)}", "--seeds", f"{first}:{last + 1}"
+    for words in (fit, evaluate):
+        print(f"next: {shlex.join(('dptse', *words))}")
 
 
 def describe(road: ImportedRoad) -> str:

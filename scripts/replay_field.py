@@ -4,34 +4,36 @@ dptse replay-field --density density.txt --speed speed.txt --cell 0.1 --interval
     --segments 6 --window 90 --repeats 2
 
 The field is the truth. Some of its segments are queried every second, by round robin, and released
-with the noise of the environment; the segments at both ends are known without noise. Estimators
-have the environment's settings.
+with noise; the segments at both ends are known.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
-from agents.environments import make_config, parse_env
+from agents.environments import make_config, quietly
 from agents.figures import LABELS
 from agents.measured_field import Replay, field_corridor, read_field
 from agents.terminal import make_table, print_table
 from dptse_env.importers.fields import FieldSource
-from dptse_env.utils.fields import integer, require
-from scripts.cli import Environment
+from dptse_env.utils.fields import integer, parse_json, require
 
-ENV = (
-    'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected", "bandwidth": 2, '
-    '"estimator_settings": {"recurrent": {"weights": "highway", "outside": true}}}'
+ENV = "dptse_env:dptse/PaperHighway-v0"
+ESTIMATORS = (
+    "ekf",
+    "ukf",
+    "random_walk",
+    "blend",
+    "recurrent",
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(Environment):
+class Args:
     """Replay a measured field of density and speed."""
 
     source: Annotated[FieldSource, arg(name="")]
@@ -41,45 +43,63 @@ class Args(Environment):
     """Lanes of the road."""
     speed_limit: float = 105.0
     """Speed limit [km/h]."""
-    env: str = ENV
-    """Environment of noise, bandwidth and settings, as above: an id and keywords as JSON."""
+    parameters: str = "w99-3lane"
+    """ARZ parameters: a shipped set or a JSON file."""
+    settings: str | None = None
+    """Estimator settings: a set, a JSON file or JSON; else tuned ones."""
+    preset: str = "corrected"
+    """Release model of the noise, one that needs no vehicles."""
+    epsilon: float = 1.0
+    """Privacy parameter of the noise."""
+    bandwidth: int = 2
+    """Segments that are queried a second."""
     window: int = 450
     """Seconds of each of the windows that the field is cut into."""
     repeats: int = 8
     """Draws of the noise."""
-    estimators: tuple[str, ...] = ("ekf", "ukf", "random_walk", "blend", "recurrent")
+    estimators: tuple[str, ...] = ESTIMATORS
     """Estimators."""
     json: bool = False
     """Print JSON, for a program, in place of a table."""
 
+    def keywords(self) -> dict[str, Any]:
+        """Return keywords of an environment, without road and estimator."""
+        settings: Any = self.settings or {}
+        if isinstance(settings, str) and settings.lstrip().startswith("{"):
+            settings = parse_json(settings, "settings")
+        return {
+            "parameters": self.parameters,
+            "estimator_settings": settings,
+            "privacy": self.preset,
+            "epsilon": self.epsilon,
+            "bandwidth": self.bandwidth,
+        }
+
 
 def main(args: Args) -> None:
     """Print the errors of every estimator."""
-    env, keywords = parse_env(args.env)
-    configs = [make_config(env, {**keywords, "estimator": each}) for each in args.estimators]
-    require(bool(configs), "estimators", "one or more", args.estimators)
-    base = configs[0]
-    require(base.privacy.preset == "corrected", "privacy", "'corrected'", base.privacy.preset)
+    require(bool(args.estimators), "estimators", "one or more", args.estimators)
+    integer("repeats", args.repeats, 1, 1000)
     measured = read_field(args.source, args.segments, args.lanes, args.speed_limit)
-    corridor = field_corridor(measured, args.lanes, args.speed_limit)
-    replay = Replay(
-        measured,
-        corridor,
-        base.arz_parameters,
-        integer("bandwidth", base.bandwidth, 1, corridor.n_mainline),
-        base.privacy.epsilon,
-        base.privacy.delta,
-        integer("window", args.window, 61, len(measured.density) - 1),
-        integer("repeats", args.repeats, 1, 1000),
-    )
-    scores = {
-        name: replay.run(name, config.settings())
-        for name, config in zip(args.estimators, configs, strict=True)
-    }
+    integer("window", args.window, 61, len(measured.density) - 1)
+    road = {"corridor": field_corridor(measured, args.lanes, args.speed_limit)}
+    given = args.keywords()
+    with quietly():
+        replays = {
+            name: Replay(
+                measured,
+                make_config(ENV, {**given, **road, "estimator": name}),
+                args.window,
+                args.repeats,
+            )
+            for name in args.estimators
+        }
+    noise = next(iter(replays.values())).sigma
+    scores = {name: replay.run() for name, replay in replays.items()}
     if args.json:
         print(json.dumps({name: score._asdict() for name, score in scores.items()}, indent=2))
         return
-    density, speed = replay.sigma
+    density, speed = noise
     table = make_table(
         f"noise: {density:.1f} veh/km, {speed:.1f} km/h",
         "estimator", "error x 1000", "density [veh/km]", "speed [km/h]", "chi2 density",

@@ -1,59 +1,82 @@
-r"""Train a recurrent network as an estimator in a folder, and go on there after an interruption.
+r"""Train recurrent networks as an estimator, for releases of flows and of speeds.
 
-dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --traffic 0:4 --validation 1000:1001 \
-    --validation-env dptse_env:dptse/ShortHighway-v0 --rounds ekf:2:4 own:2:4 --output results/net
+dptse train-estimator --seeds 0:1 --rounds ekf:2:4 own:2:4 --traffic 0:2 --validation 1000:1001 \
+    --plan '{"windows": 2, "ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}' \
+    --output results/network
 
-The folder gets network.safetensors, which the environment takes with the keywords that the command
-prints, progress.csv (the learning curve), plan.json (the settings) and checkpoint.pt. The same
-command goes on from the last checkpoint to the same numbers.
+Each kind and seed is a training in a folder of its own. The best network of each kind on validation
+traffic becomes network-flows.safetensors and network-speeds.safetensors in the output folder, a
+pair that the environment takes with the keywords that the command prints. A folder also has
+progress.csv (the learning curve), plan.json (the settings) and checkpoint.pt. The same command goes
+on from the last checkpoints to the same numbers.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import shutil
+import threading
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
+from tqdm import tqdm
 
-from agents.environments import make_config, parse_env
+from agents.environments import make_config, parse_env, quietly
+from agents.executors import run_shown
+from agents.filters.highways import draw_highway
 from agents.filters.plan import FilterPlan, Round
-from agents.filters.scenarios import ScenarioRanges
+from agents.filters.scenarios import Kind, ScenarioRanges
 from agents.filters.training import WEIGHTS, FilterTraining
-from agents.training.run_files import check_plan
+from agents.play import record
+from agents.terminal import make_table, print_table
+from agents.training.run_files import PROGRESS, Row, check_plan, read_progress
 from dptse_env.config import parse_seeds
-from dptse_env.estimators.recurrent import read_network
-from dptse_env.utils.fields import from_mapping, integer, parse_json
+from dptse_env.estimators.recurrent import member_for, read_network
+from dptse_env.utils.fields import from_mapping, parse_json, require
+from dptse_env.utils.files import replacing
 from scripts.cli import Machines
-from scripts.training_bar import Bar, watched
+
+NAME = "network"
+"""Name of the pair of networks in the output folder."""
+GLANCE = 5.0
+"""Time between two looks at the learning curves [s]."""
 
 
 @dataclass(frozen=True)
 class Args(Machines):
-    """Train a recurrent network as an estimator."""
+    """Train recurrent networks as an estimator."""
 
+    kinds: tuple[Kind, ...] = ("flows", "speeds")
+    """Kinds of releases: flows (capped, paced), or speeds (paper, corrected)."""
+    seeds: str = "0:3"
+    """Training seeds, first:stop; the best network on validation traffic is taken."""
     env: tuple[str, ...] = ()
-    """Environments to train on, each an id or 'id {keywords as JSON}', with privacy, bandwidth and
-    query policy drawn at random; eight roads if not given."""
-    traffic: str = "0:96"
+    """Environments to train in, each an id or 'id {keywords as JSON}', with release model,
+    bandwidth and query policy drawn at random; nine roads if not given. Sections of random highways
+    come beside them."""
+    traffic: str = "0:32"
     """Traffic seeds to train on, first:stop, of 0 to 999."""
-    validation_env: tuple[str, ...] = FilterPlan.validation_envs
-    """Environments to validate in, with a round robin."""
-    validation: str = "1000:1016"
+    validation_env: tuple[str, ...] = ()
+    """Environments to validate in, with a round robin, beside sections of other highways."""
+    validation: str = "1000:1008"
     """Traffic seeds to validate on, first:stop, of 1000 to 1999."""
-    rounds: tuple[str, ...] = ("ekf:72:200", "own:72:300", "own:72:400")
+    rounds: tuple[str, ...] = ("ekf:96:300", "own:96:400", "own:96:600")
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
     initial: str | None = None
-    """Network to begin with, a name such as highway-flows or a file; rounds may then all be own."""
+    """Pair of networks to begin with, as the estimator takes it; rounds may then all be own."""
     plan: str = "{}"
-    """Further fields of the plan as JSON, such as '{"ranges": {"mechanisms": ["paced"]}}'; see
+    """Further fields of the plan as JSON, such as '{"ranges": {"sections": 0.3}}'; see
     agents/filters/plan.py."""
-    seed: int = 0
-    """Training seed."""
-    threads: int = 1
-    """Threads of torch; numbers depend on it in the last digits."""
-    output: Path = Path("results/filters/0")
-    """Folder of the training."""
+    output: Path = Path("results/network")
+    """Folder of the trainings."""
+
+
+Task = tuple[FilterPlan, Path]
+"""A training and its folder."""
 
 
 def parse_round(text: str) -> Round:
@@ -68,51 +91,109 @@ def parse_round(text: str) -> Round:
     return Round(parts[0], int(parts[1]), int(parts[2]))
 
 
-def make_plan(args: Args) -> FilterPlan:
+def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
     """Return the plan that the arguments describe.
 
     Raises:
         ValueError: An argument is out of range.
     """
-    traffic, width = parse_seeds(args.traffic, "traffic"), FilterPlan.width
+    traffic, initial = parse_seeds(args.traffic, "traffic"), None
     if args.initial is not None:
-        width = read_network(args.initial).network.width
+        initial = member_for(args.initial, kind == "flows")
     plan = FilterPlan(
-        seed=args.seed,
+        kind=kind,
+        seed=seed,
         traffic_seeds=traffic,
         validation_seeds=parse_seeds(args.validation, "validation"),
         validation_envs=args.validation_env,
         ranges=ScenarioRanges(envs=args.env) if args.env else ScenarioRanges(),
         rounds=tuple(parse_round(each) for each in args.rounds),
-        width=width,
-        initial=args.initial,
-        episodes=min(FilterPlan.episodes, len(traffic)),
+        width=FilterPlan.width if initial is None else read_network(initial).network.width,
+        windows=min(FilterPlan.windows, len(traffic)),
+        initial=initial,
     )
     return from_mapping(FilterPlan, parse_json(args.plan, "plan"), "plan", plan)
 
 
 def main(args: Args) -> None:
-    """Record missing traffic, train, and print the keywords that take the network."""
-    plan = make_plan(args)
-    torch.set_num_threads(integer("threads", args.threads, 1))
-    plan.check()
-    check_plan(args.output, plan.settings())
+    """Record missing traffic, train, and print the keywords that take the networks."""
+    seeds = parse_seeds(args.seeds)
+    require(bool(args.kinds), "kinds", "one or more", args.kinds)
+    tasks = [
+        (make_plan(args, kind, seed), args.output / f"{kind}-{seed}")
+        for kind in dict.fromkeys(args.kinds)
+        for seed in seeds
+    ]
+    for plan, folder in tasks:
+        check_plan(folder, plan.settings())
+    for plan in {plan.kind: plan for plan, _ in tasks}.values():
+        plan.check()
+        record_all(args, plan)
     executor = args.start_executor()
+    last: dict[Path, Row] = {}
+    with followed(tasks):
+        work = partial(train, records=args.records)
+        run_shown(
+            executor, work, tasks, lambda task, row: last.update({task[1]: row}), progress=False
+        )
+    table = make_table("on validation traffic", "training", "error x 1000", "on sections", "chi2")
+    for folder, row in sorted(last.items()):
+        errors = [f"{1000 * row[name]:.1f}" for name in ("validation", "sections") if name in row]
+        table.add_row(folder.name, *errors, f"{row['chi2']:.2f}")
+    print_table(table)
+    for kind in dict.fromkeys(plan.kind for plan, _ in tasks):
+        folders = [folder for plan, folder in tasks if plan.kind == kind]
+        best = min(folders, key=lambda folder: last[folder]["validation"])
+        with replacing(args.output / f"{NAME}-{kind}.safetensors") as temporary:
+            shutil.copyfile(best / WEIGHTS, temporary)
+    settings = {"recurrent": {"weights": str(args.output / NAME)}}
+    print("as keywords of an environment:")
+    print(json.dumps({"estimator": "recurrent", "estimator_settings": settings}))
+
+
+def train(task: Task, records: Path | None) -> Row:
+    """Run a training to its end, and return the last row of its learning curve."""
+    plan, folder = task
+    torch.set_num_threads(1)
+    training = FilterTraining(plan, folder, records=records)
+    training.run()
+    return training.rows[-1]
+
+
+def record_all(args: Args, plan: FilterPlan) -> None:
+    """Record the traffic of the environments and highways of a plan that is missing."""
     for envs, seeds in (
         (plan.ranges.envs, plan.traffic_seeds), (plan.validation_envs, plan.validation_seeds)
     ):  # fmt: skip
         for env in envs:
-            args.library(make_config(*parse_env(env)).corridor, seeds)
-    bar = Bar("update", ("error", "validation", "chi2"), plan.n_passes, unit="pass")
-    with watched(bar, args.output) as watchers:
-        FilterTraining(
-            plan,
-            args.output,
-            records=args.records,
-            watchers=watchers,
-            progress=bar.show,
-            executor=executor,
-        ).run()
-    settings = {"recurrent": {"weights": str(args.output / WEIGHTS)}}
-    print("as keywords of an environment:")
-    print(json.dumps({"estimator": "recurrent", "estimator_settings": settings}))
+            with quietly():
+                corridor = make_config(*parse_env(env)).corridor
+            args.library(corridor, seeds)
+    numbers = [*range(*plan.ranges.highways), *range(*plan.validation_highways)]
+    for number in tqdm(numbers, desc="highways", unit="record"):
+        record(draw_highway(number), [0], args.records, workers=args.workers)
+
+
+@contextlib.contextmanager
+def followed(tasks: Sequence[Task]) -> Iterator[None]:
+    """Show a progress bar of all passes, by the learning curves that trainings write."""
+    done = threading.Event()
+
+    def look(bar: tqdm) -> None:
+        while True:
+            rows = [read_progress(f) for _, f in tasks if (f / PROGRESS).exists()]
+            found = [row["validation"] for each in rows for row in each if "validation" in row]
+            bar.set_postfix(best=f"{1000 * min(found, default=0.0):.1f}" if found else "")
+            bar.update(sum(map(len, rows)) - bar.n)
+            if done.wait(GLANCE):
+                return
+
+    total = sum(plan.n_passes for plan, _ in tasks)
+    with tqdm(total=total, desc="training", unit="pass") as bar:
+        thread = threading.Thread(target=look, args=(bar,), daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()

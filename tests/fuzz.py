@@ -255,7 +255,7 @@ def weights(rng, folder):
     shipped = sorted((SHIPPED / "estimators" / "networks").glob("*.safetensors"))
     path = folder / "network.safetensors"
     path.write_bytes(changed_tensors(one_of(shipped, rng), rng))
-    settings = {"recurrent": {"weights": str(path), "outside": True}}
+    settings = {"recurrent": {"weights": str(path)}}
     keywords = {"estimator": "recurrent", "estimator_settings": settings, "traffic_seeds": [0]}
     return path.read_bytes(), lambda: play("dptse/ShortHighway-v0", keywords), path
 

@@ -194,7 +194,7 @@ BAD = {
     "horizon must be": {"horizon": 241},
     "horizon must be below the record": {"random_start": True},
     "parameters must be one of": {"parameters": "fast"},
-    r"corridor\.segment_length must be longer for": {
+    r"corridor\.segment_length must be at least": {
         "estimator_settings": {},
         "parameters": {"name": "f", "free_flow_speed": 400.0, "jam_density": 300.0, "gamma": 1.0,
                        "relaxation_time": 50.0},

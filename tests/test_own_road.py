@@ -23,7 +23,7 @@ FAST = [
     {"estimator": "enkf", "privacy": "capped"},
     {"estimator": "mhe", "privacy": "paced"},
     {"estimator": "random_walk", "privacy": "corrected"},
-    {"estimator": "recurrent", "estimator_settings": {"recurrent": {"outside": True}}},
+    {"estimator": "recurrent"},
 ]
 CASES = [
     *FAST,
@@ -75,16 +75,31 @@ def test_a_count_scatters_less_in_density_on_a_longer_segment():
     )
 
 
+def test_a_network_on_a_road_unlike_those_it_was_trained_on_says_so(road_file):
+    name = "estimator_settings.recurrent.weights"
+    with pytest.warns(UserWarning, match=f"{name}: values measured or tuned on"):
+        env = gym.make(ID, corridor=road_file, traffic_seeds=[0], estimator="recurrent")
+    assert name in env.reset(seed=0)[1]["inherited"]
+    assert gym.make(ID, estimator="recurrent").unwrapped.config.inherited == ()
+
+
 def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):
-    with pytest.raises(ValueError, match="were trained on"):
-        make(road_file, estimator="recurrent")
     road = tmp_path / "short.toml"
     write_corridor(road, dataclasses.replace(ROAD, segment_length=(0.1,) * 7 + (0.04,)))
-    message = r"^corridor\.segment_length must be longer for the parameters 'paper': on 0\.04 km"
-    with pytest.raises(ValueError, match=message):
+    message = r"short\.toml: corridor\.segment_length must be at least 0\.0567 km .*, got 0\.04 km"
+    with pytest.raises(ValueError, match=message + ".* an estimator .*: random_walk, recurrent"):
         make(str(road), parameters="paper")
     # A random walk does not step the model.
     make(str(road), parameters="paper", estimator="random_walk").reset(seed=0)
+
+
+def test_python_tells_once_what_is_not_of_the_road(road_file):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("default")
+        for _ in range(2):
+            gym.make(ID, corridor=road_file)
+        gym.make_vec(ID, num_envs=2, corridor=road_file)
+    assert len(told) == 1
 
 
 def test_a_reset_names_what_is_not_of_the_road(tmp_path):

@@ -1,34 +1,38 @@
 """Episodes of scenarios: what an estimator is given, beside the true traffic, and batches of them.
 
-A batch mixes the scenarios of one road. What the network reads of releases depends on what it
+A batch mixes scenarios on any roads. What the network reads of releases depends on what it
 predicted, so that it is read anew in every pass, by the estimator's own kernel.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from agents.environments import make_vector
-from agents.filters.network import Road
+from agents.environments import make_vector, quietly
+from agents.filters.network import Roads
 from agents.filters.scenarios import Scenario
 from agents.play import record
 from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent_kernels import N_CHANNELS, Cells, make_cells, read
 from dptse_env.evaluation import Row, evaluate
 from dptse_env.process import QueryProcess
-from dptse_env.traffic import Corridor, Records
-from dptse_env.traffic.corridor import GEOMETRY
+from dptse_env.traffic import Corridor, Records, open_library
 from dptse_env.utils.arrays import AnyArray, FloatArray
+from dptse_env.vector_env import SensorQueryVectorEnv
 
-_SAME = (*GEOMETRY, "duration", "density_scale", "speed_scale")
-"""Fields of a corridor that the episodes of a batch share."""
+EACH = 4
+"""Episodes of one scenario in a batch."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +61,6 @@ class Episodes:
     inputs: AnyArray
     truth: AnyArray
 
-    @property
-    def road(self) -> list[object]:
-        """Values that the episodes of a batch have in common."""
-        return [getattr(self.corridor, name) for name in _SAME]
-
     def pick(self, chosen: AnyArray) -> Episodes:
         """Return some of the episodes, in double precision."""
         names = ("observed", "values", "sigma", "centre", "inputs", "truth")
@@ -79,16 +78,31 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) 
         estimator: Keywords ``estimator`` and ``estimator_settings``.
         records: Library of records, or its folder; None for the user's cache.
     """
-    seeds = scenario.traffic_seeds
-    keywords = {**scenario.keywords, **estimator, "traffic_seeds": list(seeds), "records": records}
+    seeds, library = scenario.traffic_seeds, open_library(records)
+    keywords = {**scenario.keywords, **estimator, "traffic_seeds": list(seeds), "records": library}
     # One thread, so that the estimator is given all episodes in one call.
     keywords |= {"action": "scores", "threads": 1}
-    env = make_vector(scenario.env, len(seeds), keywords)
-    record(env.config.corridor, seeds, records)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(quietly())
+        if scenario.section is not None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dptse-section-")))
+            keywords["corridor"] = str(scenario.section.write(folder, library))
+        env = make_vector(scenario.env, len(seeds), keywords)
+        record(env.config.corridor, seeds, library)
+        return _play(env, scenario)
+
+
+def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
     process = env.process
     recorder, watcher = _Recorder(process), _Watcher(process)
     process.estimator = recorder  # type: ignore[assignment]
-    evaluate(env, scenario.schedule, seeds, scenario.noise_seed, watchers=[lambda _: watcher])
+    evaluate(
+        env,
+        scenario.schedule,
+        scenario.traffic_seeds,
+        scenario.noise_seed,
+        watchers=[lambda _: watcher],
+    )
     env.close()
     measured = [np.stack(arrays) for arrays in zip(*recorder.measured, strict=True)]
     observed, values, sigma, centre = measured
@@ -155,62 +169,81 @@ def _single(array: AnyArray) -> AnyArray:
 
 
 def draw_batch(rng: np.random.Generator, collected: Sequence[Episodes], n: int) -> Batch:
-    """Return `n` episodes, drawn from all scenarios on the road of one that is drawn first."""
-    road = collected[int(rng.integers(len(collected)))].road
-    scenarios = [each for each in collected if each.road == road]
-    ends = np.cumsum([len(each.start) for each in scenarios])
-    drawn = np.sort(rng.choice(ends[-1], size=min(n, int(ends[-1])), replace=False))
-    owners = np.searchsorted(ends, drawn, side="right")
-    return Batch(
-        [
-            each.pick(drawn[owners == k] - (ends[k] - len(each.start)))
-            for k, each in enumerate(scenarios)
-            if k in owners
-        ]
-    )
+    """Return `n` episodes of scenarios that are drawn with replacement, `EACH` of one at most."""
+    parts, left = list[Episodes](), n
+    while left > 0:
+        drawn = collected[int(rng.integers(len(collected)))]
+        k = min(EACH, left, len(drawn.start))
+        parts.append(drawn.pick(np.sort(rng.choice(len(drawn.start), size=k, replace=False))))
+        left -= k
+    return Batch(parts)
 
 
 class Batch:
-    """Episodes of several scenarios on one road, as a training takes them.
+    """Episodes of several scenarios as a training takes them: C cells of any roads in a row.
 
     Attributes:
-        road: The road.
-        start: Density, speed and their deviations of the prior, double precision, (k, S, 4).
-        truth: Density and speed in the seconds 1 to T, (T, k, S, 2).
+        roads: The cells.
+        start: Density, speed and their deviations of the prior, double precision, (C, 4).
+        truth: Density and speed in the seconds 1 to T, (T, C, 2).
     """
 
     def __init__(self, parts: Sequence[Episodes]) -> None:
-        """Take scenarios of one road."""
-        self._parts, first = parts, parts[0]
-        self._owners = np.cumsum([0, *(len(part.start) for part in parts)])
-        cells, corridor = first.cells, first.corridor
-        upstream = torch.zeros(2 * (cells.lanes.size,))
-        upstream[cells.edges[:, 1], cells.edges[:, 0]] = 1.0
-        self.road = Road(
-            torch.from_numpy(cells.unit).float(),
-            cells.limit,
-            upstream,
-            (corridor.density_scale, corridor.speed_scale),
-            corridor.n_mainline,
-        )
-        self.start = np.concatenate([part.start for part in parts])
-        truth = np.concatenate([part.truth for part in parts], axis=1)
-        self.truth = torch.from_numpy(truth).float()
+        """Take scenarios of equally many seconds."""
+        self._parts = parts
+        sizes = [len(part.start) * part.cells.lanes.size for part in parts]
+        ends = np.cumsum([0, *sizes])
+        self._places = [slice(*pair) for pair in itertools.pairwise(ends)]
+        self.roads = _roads(parts)
+        self.start = np.concatenate([part.start.reshape(-1, 4) for part in parts])
+        truth = [part.truth.reshape(len(part.truth), -1, 2) for part in parts]
+        self.truth = torch.from_numpy(np.concatenate(truth, axis=1)).float()
 
     def channels(self, t: int, predicted: FloatArray, age: FloatArray) -> Tensor:
-        """Return what the network reads in second t + 1, shape (k, S, C).
+        """Return what the network reads in second t + 1, shape (C, channels).
 
         Args:
             t: Index of the second.
-            predicted: Prediction of that second and its deviations, shape (k, S, 4).
-            age: Seconds since the last measurement, shape (k, S), counted on.
+            predicted: Prediction of that second and its deviations, shape (C, 4).
+            age: Seconds since the last measurement, shape (C,), counted on.
         """
-        x = np.empty((*age.shape, N_CHANNELS), dtype=np.float32)
-        for part, first, last in zip(self._parts, self._owners, self._owners[1:], strict=False):
-            own = slice(first, last)
+        x = np.empty((len(age), N_CHANNELS), dtype=np.float32)
+        for part, place in zip(self._parts, self._places, strict=True):
+            k = len(part.start)
             read(
-                part.cells, np.arange(last - first), part.observed[t], part.values[t],
-                part.sigma[t], part.centre[t], part.inputs[t], predicted[own], age[own],
-                np.empty(part.sigma[t].shape), x[own],
+                part.cells, np.arange(k), part.observed[t], part.values[t], part.sigma[t],
+                part.centre[t], part.inputs[t], predicted[place].reshape(k, -1, 4),
+                age[place].reshape(k, -1), np.empty(part.sigma[t].shape),
+                x[place].reshape(k, -1, N_CHANNELS),
             )  # fmt: skip
         return torch.from_numpy(x)
+
+
+def _roads(parts: Sequence[Episodes]) -> Roads:
+    """Return the cells of all episodes."""
+    unit, limit, edges, scales, mainline, episode = ([] for _ in range(6))
+    first = n_episodes = 0
+    for part in parts:
+        cells, corridor, k = part.cells, part.corridor, len(part.start)
+        S = cells.lanes.size
+        unit.append(np.tile(cells.unit, k))
+        limit.append(np.full(k * S, cells.limit))
+        offsets = first + S * np.arange(k)[:, None, None]
+        edges.append((cells.edges + offsets).reshape(-1, 2))
+        scales.append(np.tile([corridor.density_scale, corridor.speed_scale], (k * S, 1)))
+        mainline.append(np.tile(np.arange(S) < corridor.n_mainline, k))
+        episode.append(n_episodes + np.repeat(np.arange(k), S))
+        first, n_episodes = first + k * S, n_episodes + k
+
+    def joined(arrays: list[AnyArray], dtype: torch.dtype) -> Tensor:
+        return torch.from_numpy(np.concatenate(arrays)).to(dtype)
+
+    return Roads(
+        unit=joined(unit, torch.float32),
+        limit=joined(limit, torch.float32),
+        edges=joined(edges, torch.int64),
+        scales=joined(scales, torch.float32),
+        mainline=joined(mainline, torch.float32),
+        episode=joined(episode, torch.int64),
+        n_episodes=n_episodes,
+    )

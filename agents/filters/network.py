@@ -19,14 +19,21 @@ from dptse_env.estimators.recurrent_kernels import (
 )
 
 
-class Road(NamedTuple):
-    """The cells of a road and their connections, and how errors are measured on it."""
+class Roads(NamedTuple):
+    """The cells of k episodes one after another, whatever their roads, and how errors count."""
 
-    unit: Tensor  # (S,) of densities [veh/km]
-    limit: float  # unit of speeds [km/h]
-    upstream: Tensor  # (S, S) flags of the cells (columns) upstream of each
-    scales: tuple[float, float]  # of errors of densities [veh/km] and speeds [km/h]
-    n_mainline: int
+    unit: Tensor  # (C,) of densities [veh/km]
+    limit: Tensor  # (C,) unit of speeds [km/h]
+    edges: Tensor  # (E, 2) cells (from, to) between which vehicles pass
+    scales: Tensor  # (C, 2) of errors of densities [veh/km] and speeds [km/h]
+    mainline: Tensor  # (C,) flags
+    episode: Tensor  # (C,) index of the episode
+    n_episodes: int
+
+    def per_episode(self, values: Tensor) -> Tensor:
+        """Return sums over the cells of each episode: (..., C) to (..., k)."""
+        sums = values.new_zeros(*values.shape[:-1], self.n_episodes)
+        return sums.index_add(-1, self.episode, values)
 
 
 class RecurrentNetwork(nn.Module):
@@ -59,17 +66,20 @@ class RecurrentNetwork(nn.Module):
             # Cells remember for a second, or for as long as a minute.
             self.inputs_bias[:width] = torch.linspace(0.0, 4.0, width)
 
-    def forward(self, road: Road, x: Tensor, h: Tensor) -> Tensor:
+    def forward(self, roads: Roads, x: Tensor, h: Tensor) -> Tensor:
         """Return the hidden states after a second.
 
         Args:
-            road: The road.
-            x: The channels of every cell, as `recurrent_kernels.read` writes them, shape (k, S, C).
-            h: Hidden states before, shape (k, S, H).
+            roads: The cells.
+            x: Their channels, as `recurrent_kernels.read` writes them, shape (C, channels).
+            h: Hidden states before, shape (C, H).
         """
         H = self.width
         messages = h[..., : message_width(H)]
-        up, down = road.upstream @ messages, road.upstream.T @ messages
+        start, end = roads.edges.unbind(-1)
+        none = torch.zeros_like(messages)
+        up = none.index_add(0, end, messages[start])
+        down = none.index_add(0, start, messages[end])
         g = torch.cat([x, up, down], -1) @ self.inputs + self.inputs_bias
         q = h @ self.hidden + self.hidden_bias
         gates = torch.sigmoid(g[..., : 2 * H] + q[..., : 2 * H])
@@ -77,13 +87,13 @@ class RecurrentNetwork(nn.Module):
         n = torch.tanh(g[..., 2 * H :] + r * q[..., 2 * H :])
         return n + z * (h - n)
 
-    def read(self, road: Road, h: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the heads say of hidden states (..., S, H): of this second, and the next.
+    def read(self, roads: Roads, h: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the heads say of hidden states (..., C, H): of this second, and the next.
 
-        Density [veh/km], speed [km/h] and their standard deviations, shape (..., S, 4) each.
+        Density [veh/km], speed [km/h] and their standard deviations, shape (..., C, 4) each.
         """
         raw = h @ self.heads + self.heads_bias
-        return _outputs(road, raw[..., :4]), _outputs(road, raw[..., 4:])
+        return _outputs(roads, raw[..., :4]), _outputs(roads, raw[..., 4:])
 
     def take(self, weights: Network) -> None:
         """Take weights of the same width."""
@@ -100,34 +110,35 @@ class RecurrentNetwork(nn.Module):
         return Network(**arrays)
 
 
-def _outputs(road: Road, raw: Tensor) -> Tensor:
+def _outputs(roads: Roads, raw: Tensor) -> Tensor:
     mean = torch.sigmoid(raw[..., :2])
     spread = torch.exp(torch.clip(raw[..., 2:], LOWEST_SPREAD, HIGHEST_SPREAD))
     parts = [
-        DENSITY_RANGE * road.unit * mean[..., 0], SPEED_RANGE * road.limit * mean[..., 1],
-        road.unit * spread[..., 0], road.limit * spread[..., 1],
+        DENSITY_RANGE * roads.unit * mean[..., 0], SPEED_RANGE * roads.limit * mean[..., 1],
+        roads.unit * spread[..., 0], roads.limit * spread[..., 1],
     ]  # fmt: skip
     return torch.stack(parts, -1)
 
 
-def second_loss(road: Road, estimated: Tensor, truth: Tensor, likelihood: float) -> Tensor:
-    """Return the loss of a second, averaged over all leading dimensions.
+def second_loss(roads: Roads, estimated: Tensor, truth: Tensor, likelihood: float) -> Tensor:
+    """Return the loss of a second, averaged over episodes and all leading dimensions.
 
     The environment's error over the mainline, and `likelihood` times the negative log-likelihood
     of all cells under independent normal distributions. Speeds of empty cells do not count.
 
     Args:
-        road: The road.
-        estimated: Shape (..., S, 4).
-        truth: Shape (..., S, 2).
+        roads: The cells.
+        estimated: Shape (..., C, 4).
+        truth: Shape (..., C, 2).
         likelihood: Weight of the likelihood.
     """
-    scales = torch.tensor(road.scales)
-    error, spread = (estimated[..., :2] - truth) / scales, estimated[..., 2:] / scales
+    error = (estimated[..., :2] - truth) / roads.scales
+    spread = estimated[..., 2:] / roads.scales
     occupied = (truth[..., 0] > 0.0).float()
     counts = torch.stack([torch.ones_like(occupied), occupied], -1)
-    squares = error**2 * counts
-    n = road.n_mainline
-    total = squares[..., :n, :].sum((-1, -2)) / counts[..., :n, :].sum((-1, -2))
+    mainline = roads.mainline[:, None] * counts
+    total = roads.per_episode((error**2 * mainline).sum(-1))
+    mean = total / roads.per_episode(mainline.sum(-1))
     surprise = (torch.log(spread) + 0.5 * (error / spread) ** 2) * counts
-    return torch.sqrt(total + 1e-8).mean() + likelihood * surprise.sum() / counts.sum()
+    each = roads.per_episode(surprise.sum(-1)) / roads.per_episode(counts.sum(-1))
+    return torch.sqrt(mean + 1e-8).mean() + likelihood * each.mean()

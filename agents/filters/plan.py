@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from itertools import product
@@ -19,13 +19,13 @@ from typing import Annotated, Any
 import numpy as np
 
 from agents.environments import make_config, parse_env, quietly
-from agents.filters.scenarios import Scenario, ScenarioRanges
+from agents.filters.highways import LANES, LENGTHS, LIMITS, SEGMENTS, Section, draw_highway
+from agents.filters.scenarios import MECHANISMS, PRIVATE, Kind, Scenario, ScenarioRanges
 from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.recurrent import FORMAT, read_network
 from dptse_env.estimators.recurrent_kernels import CHANNELS
-from dptse_env.parts import make_task
 from dptse_env.utils.fields import Interval, checked_fields, integer, require
 
 
@@ -56,8 +56,27 @@ OWN = "own"
 
 def played_by(weights: Path) -> dict[str, Any]:
     """Return the keywords of an environment whose estimator is a network, given as a file."""
-    settings = {"weights": str(weights.resolve()), "outside": True}
-    return {"estimator": "recurrent", "estimator_settings": {"recurrent": settings}}
+    settings = {"recurrent": {"weights": str(weights.resolve())}}
+    return {"estimator": "recurrent", "estimator_settings": settings}
+
+
+VALIDATION: dict[Kind, tuple[str, ...]] = {
+    "flows": (
+        PRIVATE,
+        f'{PRIVATE} {{"privacy": "capped"}}',
+        'dptse_env:dptse/LongHighway-v0 {"horizon": 600}',
+    ),
+    "speeds": (
+        "dptse_env:dptse/PaperHighway-v0",
+        'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected"}',
+    ),
+}
+"""Environments that a training validates in."""
+ON_SECTIONS: dict[Kind, dict[str, Any]] = {
+    "flows": {"preset": "paced", "boundary_inputs": "nominal"},
+    "speeds": {"preset": "corrected", "epsilon": 1.0},
+}
+"""Release models on the sections that a training validates on."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +84,19 @@ class FilterPlan:
     """Everything that decides the numbers of a training.
 
     Attributes:
+        kind: What is released beside densities, flows or speeds.
         seed: Training seed: scenarios, first weights, order.
         traffic_seeds: Traffic seeds to train on.
         validation_seeds: Traffic seeds to validate on.
         validation_envs: Environments to validate in, as ``ID`` or ``ID {JSON}``.
+        validation_highways: First and last number of the highways to validate on, the last one left
+            out: a section of each.
         ranges: Ranges that scenarios are drawn from.
         rounds: Rounds, one after the other.
         width: Width of the hidden state.
-        episodes: Episodes of a scenario, and of a batch, which mixes the scenarios of a road.
+        windows: Windows of a section, or traffic seeds of another scenario.
+        episodes: Episodes of a batch, which mixes scenarios on any roads.
+        seconds: Length of an episode [s].
         window: Seconds over which gradients are propagated.
         learning_rate: Of Adam at the beginning; it falls along a cosine.
         likelihood: Weight of the likelihood in the loss.
@@ -86,36 +110,44 @@ class FilterPlan:
         ValueError: A value is out of range.
     """
 
+    kind: Kind
     seed: Annotated[int, Interval(0, 2**31)]
-    traffic_seeds: tuple[int, ...]
-    validation_seeds: tuple[int, ...]
-    validation_envs: tuple[str, ...] = (
-        'dptse_env:dptse/PrivateHighway-v1 {"privacy": "capped"}',
-        "dptse_env:dptse/PrivateHighway-v1",
-        "dptse_env:dptse/PaperHighway-v0",
-    )
+    traffic_seeds: tuple[int, ...] = tuple(TRAINING_SEEDS[:32])
+    validation_seeds: tuple[int, ...] = tuple(VALIDATION_SEEDS[:8])
+    validation_envs: tuple[str, ...] = ()
+    validation_highways: tuple[int, int] = (1000, 1012)
     ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
     rounds: tuple[Round, ...] = (
-        Round("ekf", 72, 200),
-        Round(OWN, 72, 300),
-        Round(OWN, 72, 400),
+        Round("ekf", 96, 300),
+        Round(OWN, 96, 400),
+        Round(OWN, 96, 600),
     )
     width: Annotated[int, Interval(1, 512)] = 64
-    episodes: int = 32
+    windows: Annotated[int, Interval(1, 24)] = 8
+    episodes: Annotated[int, Interval(1, 10_000)] = 32
+    seconds: Annotated[int, Interval(1, 600)] = 400
     window: Annotated[int, Interval(1, 10_000)] = 50
     learning_rate: Annotated[float, Interval(0, 1, open_low=True)] = 4e-3
     likelihood: Annotated[float, Interval(0, 1)] = 0.03
     prediction: Annotated[float, Interval(0, 10)] = 0.3
     clip_norm: Annotated[float, Interval(0, 1e6, open_low=True)] = 1.0
-    checkpoint_every: Annotated[int, Interval(1, 1_000_000)] = 20
+    checkpoint_every: Annotated[int, Interval(1, 1_000_000)] = 100
     initial: str | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
         checked_fields(self, "")
+        if not self.validation_envs:
+            object.__setattr__(self, "validation_envs", VALIDATION[self.kind])
         require_seeds("traffic", self.traffic_seeds, TRAINING_SEEDS)
         require_seeds("validation", self.validation_seeds, VALIDATION_SEEDS)
-        integer("episodes", self.episodes, 1, len(self.traffic_seeds))
+        integer("windows", self.windows, 1, len(self.traffic_seeds))
+        first, stop = self.validation_highways
+        apart = (
+            0 <= first <= stop and not self.ranges.highways[0] <= first < self.ranges.highways[1]
+        )
+        allowed = f"first and last number outside of {self.ranges.highways}"
+        require(apart, "validation_highways", allowed, self.validation_highways)
         if not self.rounds or (self.initial is None and self.rounds[0].estimator == OWN):
             raise ValueError(
                 "rounds must begin with one of another estimator where no initial network is "
@@ -132,14 +164,18 @@ class FilterPlan:
         return sum(each.passes for each in self.rounds)
 
     def scenarios(self, index: int) -> list[Scenario]:
-        """Return the scenarios of a round; the same ones whenever it is called."""
+        """Return the scenarios of a round, those on sections first; always the same ones."""
         rng = np.random.default_rng([self.seed, index])
-        traffic, n = self.traffic_seeds, self.rounds[index].scenarios
-        drawn = [self.ranges.draw(rng, traffic, self.episodes) for _ in range(n)]
-        first = TUNING.start
+        n = self.rounds[index].scenarios
+        on_sections, first = round(self.ranges.sections * n), TUNING.start
         return [
-            dataclasses.replace(scenario, noise_seed=first + 10_000 * (index * n + k))
-            for k, scenario in enumerate(drawn)
+            dataclasses.replace(
+                self.ranges.draw(
+                    rng, self.kind, self.traffic_seeds, self.windows, self.seconds, k < on_sections
+                ),
+                noise_seed=first + 10_000 * (index * n + k),
+            )
+            for k in range(n)
         ]
 
     def rate(self, done: int) -> float:
@@ -153,31 +189,53 @@ class FilterPlan:
             plain["initial_sha256"] = read_network(self.initial).card["sha256"]
         return plain
 
-    def validation_cells(self, estimator: Mapping[str, Any] = MappingProxyType({})) -> list[Cell]:
-        """Return the cells of a validation, of the environments' estimators or of another one."""
-        options: dict[str, Any] = {"noise_seed": TUNING.start, "watchers": ("honesty",)}
+    def validation_sections(self) -> list[Section]:
+        """Return the sections that are validated on, with queues of any kind."""
+        numbers = range(*self.validation_highways)
+        longest = [draw_highway(number).n_mainline - 2 for number in numbers]
         return [
+            Section(number, min(8 + 2 * (k % 6), most), 4, self.seconds)
+            for k, (number, most) in enumerate(zip(numbers, longest, strict=True))
+        ]
+
+    def validation_cells(
+        self, roads: Sequence[Path] = (), estimator: Mapping[str, Any] = MappingProxyType({})
+    ) -> list[Cell]:
+        """Return the cells of a validation.
+
+        Args:
+            roads: Road files of `validation_sections`.
+            estimator: Keywords of an estimator in place of the environments'.
+        """
+        options: dict[str, Any] = {"noise_seed": TUNING.start, "watchers": ("honesty",)}
+        cells = [
             Cell(env, "round-robin", {**keywords, **estimator}, **options)
             for env, keywords in map(parse_env, self.validation_envs)
         ]
+        for road in roads:
+            keywords = {"corridor": str(road), "bandwidth": 2, "privacy": ON_SECTIONS[self.kind]}
+            seeds = tuple(range(4))
+            cell = Cell(PRIVATE, "round-robin", {**keywords, **estimator}, seeds=seeds, **options)
+            cells.append(cell)
+        return cells
 
     def card(self, done: int, name: str) -> dict[str, Any]:
         """Return the card of a network after `done` passes: what it was trained on."""
         ranges = self.ranges
-        configs = [
-            make_config(env, {**keywords, "privacy": mechanism})
-            for env, keywords in map(parse_env, ranges.envs)
-            for mechanism in ranges.mechanisms
-        ]
-        roads = [config.corridor for config in configs]
+        roads = [make_config(*parse_env(each)).corridor for each in ranges.envs]
         found: dict[str, list[float]] = {
-            "n_mainline": [road.n_mainline for road in roads],
+            "n_mainline": [float(road.n_mainline) for road in roads],
             "segment_length": [length for road in roads for length in road.segment_lengths],
             "speed_limit": [limit for road in roads for limit in road.speed_limits],
             "lanes": [float(count) for road in roads for count in road.segment_lanes],
             "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
-            "flows": [float(make_task(config).releases_flow) for config in configs],
+            "flows": [float(self.kind == "flows")],
         }
+        if ranges.sections > 0.0:
+            found["n_mainline"] += SEGMENTS
+            found["segment_length"] += LENGTHS
+            found["speed_limit"] += LIMITS
+            found["lanes"] += LANES
         return {
             "name": name,
             "format": FORMAT,
@@ -202,7 +260,7 @@ class FilterPlan:
             cells += [Cell(env, schedule, keywords) for schedule in self.ranges.schedules]
             cells += [
                 Cell(env, "none", {**keywords, "privacy": mechanism, "estimator": estimator})
-                for mechanism, estimator in product(self.ranges.mechanisms, estimators)
+                for mechanism, estimator in product(MECHANISMS[self.kind], estimators)
             ]
         with quietly():
             for cell in cells:

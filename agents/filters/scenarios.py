@@ -8,27 +8,32 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from agents.environments import make_config, parse_env
-from dptse_env.utils.fields import require
+from agents.filters.highways import SEGMENTS, Section, draw_highway
+from dptse_env.utils.fields import Interval, checked_fields, require
 
-MECHANISMS = ("capped", "paced", "paper", "corrected")
+Kind = Literal["flows", "speeds"]
+"""What is released beside densities; a network knows one of them."""
+MECHANISMS: dict[Kind, tuple[str, ...]] = {
+    "flows": ("capped", "paced"), "speeds": ("paper", "corrected"),
+}  # fmt: skip
 """Release models that scenarios draw from."""
 SCHEDULES = (
     "round-robin", "paper", "random", "oldest-first", "static", "stale-variance",
-    "largest-variance", "largest-deviation",
+    "largest-variance", "largest-deviation", "expected-reduction",
 )  # fmt: skip
-"""Query policies that scenarios draw from; the last three follow the estimator's own deviations."""
-
-
-_PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
+"""Query policies that scenarios draw from; the last four follow the estimator's own deviations."""
+BOUNDARIES = ("true", "nominal", "private")
+"""Sources of the boundary inputs that scenarios draw from."""
+PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
 
 
 def _road(**keywords: Any) -> str:
-    return f"{_PRIVATE} {json.dumps(keywords)}"
+    return f"{PRIVATE} {json.dumps(keywords)}"
 
 
 def _other_road(n_mainline: int, lanes: int, flows: Any, at_ramps: Any, **fields: Any) -> str:
@@ -45,9 +50,10 @@ def _other_road(n_mainline: int, lanes: int, flows: Any, at_ramps: Any, **fields
 
 
 ROADS = (
-    _PRIVATE,
+    PRIVATE,
     "dptse_env:dptse/PaperHighway-v0",
-    "dptse_env:dptse/ShortHighway-v0",
+    'dptse_env:dptse/ShortHighway-v0 {"corridor": {"duration": 600}}',
+    "dptse_env:dptse/LongHighway-v0",
     _road(
         demand={
             "base": {
@@ -72,8 +78,8 @@ ROADS = (
         on_ramps=(4, 12), off_ramps=(8, 16), fixed_sensors=(19, 22, 23),
     ),
 )  # fmt: skip
-"""The three roads of the package; the paper's with random incidents and another demand or
-other drivers; a road of 1 km with two lanes, and one of 2 km with four."""
+"""The roads of the package; the paper's with random incidents and another demand or other
+drivers; a road of 1 km with two lanes, and one of 2 km with four."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +92,7 @@ class Scenario:
         schedule: Query schedule.
         traffic_seeds: Traffic seeds.
         noise_seed: Noise and estimators are seeded with this plus the traffic seed.
+        section: The road, where it is a section of a highway.
     """
 
     env: str
@@ -93,6 +100,7 @@ class Scenario:
     schedule: str
     traffic_seeds: tuple[int, ...]
     noise_seed: int
+    section: Section | None = None
 
 
 @dataclass(frozen=True)
@@ -101,7 +109,8 @@ class ScenarioRanges:
 
     Attributes:
         envs: Environments, each an id or an id, a space and keywords as JSON (`parse_env`).
-        mechanisms: Release models, each as often as the others.
+        sections: Share of the scenarios that are on sections of highways, not in one of `envs`.
+        highways: First and last number of these highways, the last one left out.
         schedules: Query schedules.
         epsilon: Range of epsilon, drawn evenly in its logarithm.
         deltas: Values of delta.
@@ -109,14 +118,14 @@ class ScenarioRanges:
         clips: Range of the clip of ``paced`` [km/h].
         paces: Range of the pace of ``paced``.
         spans: Spans of queries under ``paced``.
-        largest_share: Largest bandwidth as a share of the segments.
 
     Raises:
-        ValueError: The share is not in (0, 1].
+        ValueError: A share is not in [0, 1], or there is no highway.
     """
 
     envs: tuple[str, ...] = ROADS
-    mechanisms: tuple[str, ...] = MECHANISMS
+    sections: Annotated[float, Interval(0, 1)] = 0.5
+    highways: tuple[int, int] = (0, 80)
     schedules: tuple[str, ...] = SCHEDULES
     epsilon: tuple[float, float] = (0.5, 20.0)
     deltas: tuple[float, ...] = (0.05, 0.001)
@@ -124,44 +133,99 @@ class ScenarioRanges:
     clips: tuple[float, float] = (18.0, 51.0)
     paces: tuple[float, float] = (0.7, 0.95)
     spans: tuple[tuple[int, ...], ...] = ((1,), (2,), (1, 2))
-    largest_share: float = 1.0
 
     def __post_init__(self) -> None:
         """Check values."""
-        within = 0.0 < self.largest_share <= 1.0
-        require(within, "ranges.largest_share", "in (0, 1]", self.largest_share)
+        checked_fields(self, "ranges")
+        first, stop = self.highways
+        require(0 <= first < stop, "ranges.highways", "first and last number", self.highways)
 
-    def draw(self, rng: np.random.Generator, traffic: Sequence[int], n_episodes: int) -> Scenario:
-        """Draw a scenario on `n_episodes` of the traffic seeds.
+    def draw(
+        self,
+        rng: np.random.Generator,
+        kind: Kind,
+        traffic: Sequence[int],
+        n_episodes: int,
+        seconds: int,
+        on_section: bool,
+    ) -> Scenario:
+        """Draw a scenario.
 
-        The bandwidth is drawn from 1 to all segments, or to a share of them.
+        The bandwidth is drawn from 1 to all segments, evenly in its logarithm.
+
+        Args:
+            rng: Source of randomness.
+            kind: What is released.
+            traffic: Traffic seeds of the environments.
+            n_episodes: Number of episodes.
+            seconds: Length of an episode [s]; it begins anywhere in a longer record.
+            on_section: Whether the road is a section of a highway.
         """
-        env, keywords = parse_env(str(rng.choice(self.envs)))
-        n_mainline = make_config(env, keywords).corridor.n_mainline
-        most = max(int(self.largest_share * n_mainline), 1)
-        mechanism = str(rng.choice(self.mechanisms))
+        mechanism = str(rng.choice(MECHANISMS[kind]))
+        section, seeds = None, tuple(range(n_episodes))
+        if on_section:
+            averaged = kind == "speeds" and rng.random() < 0.5
+            section = self._draw_section(rng, n_episodes, seconds, averaged)
+            env, keywords, n_mainline = PRIVATE, dict[str, Any](), section.segments
+        else:
+            env, keywords = parse_env(str(rng.choice(self.envs)))
+            corridor = make_config(env, keywords).corridor
+            n_mainline = corridor.n_mainline
+            drawn = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
+            seeds = tuple(int(seed) for seed in drawn)
+            keywords |= {"horizon": seconds, "random_start": seconds < corridor.duration}
+        privacy = self._draw_privacy(rng, mechanism)
+        if section is not None or rng.random() < 0.3:
+            known = BOUNDARIES[: 2 if section and section.averaged else 3]
+            privacy["boundary_inputs"] = str(rng.choice(known))
+        largest = n_mainline
+        if mechanism == "paced":
+            spans = self.spans[int(rng.integers(len(self.spans)))]
+            if spans != (1,):
+                keywords |= {"query_spans": list(spans), "bandwidth_unit": "sums"}
+                largest = max(2 * n_mainline // 3, 1)
+        bandwidth = int(np.exp(rng.uniform(0.0, np.log(largest + 1.0))))
+        return Scenario(
+            env=env,
+            keywords={**keywords, "privacy": privacy, "bandwidth": bandwidth},
+            schedule=str(rng.choice(self.schedules)),
+            traffic_seeds=seeds,
+            noise_seed=int(rng.integers(10**6, 2 * 10**6)),
+            section=section,
+        )
+
+    def _draw_section(
+        self, rng: np.random.Generator, windows: int, seconds: int, averaged: bool
+    ) -> Section:
+        number = int(rng.integers(*self.highways))
+        most = min(draw_highway(number).n_mainline - 2, SEGMENTS[1])
+        fewest = SEGMENTS[0]
+        segments = int(np.exp(rng.uniform(np.log(fewest), np.log(min(20, most) + 1.0))))
+        if rng.random() < 0.1:
+            segments = most
+        n_sensors = int(rng.choice([0, 1, 2, 3], p=[0.6, 0.2, 0.1, 0.1]))
+        sensors = rng.choice(segments, size=n_sensors, replace=False)
+        return Section(
+            number,
+            segments,
+            windows,
+            seconds,
+            averaged=int(rng.integers(3, 11)) if averaged else 0,
+            sensors=tuple(int(each) for each in sensors),
+            seed=int(rng.integers(2**31)),
+        )
+
+    def _draw_privacy(self, rng: np.random.Generator, mechanism: str) -> dict[str, Any]:
         low, high = np.log(self.epsilon)
         privacy: dict[str, Any] = {
             "preset": mechanism,
             "epsilon": round(float(np.exp(rng.uniform(low, high))), 3),
             "delta": float(rng.choice(self.deltas)),
         }
-        keywords |= {"privacy": privacy, "bandwidth": int(rng.integers(1, most + 1))}
         if mechanism == "capped":
             low, high = np.log(self.caps)
             privacy["cap"] = int(np.exp(rng.uniform(low, high)))
         elif mechanism == "paced":
             privacy["clip"] = round(float(rng.uniform(*self.clips)), 1)
             privacy["pace"] = round(float(rng.uniform(*self.paces)), 3)
-            spans = self.spans[int(rng.integers(len(self.spans)))]
-            if spans != (1,):
-                keywords |= {"query_spans": list(spans), "bandwidth_unit": "sums"}
-                keywords["bandwidth"] = int(rng.integers(1, max(2 * most // 3, 2)))
-        seeds = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
-        return Scenario(
-            env=env,
-            keywords=keywords,
-            schedule=str(rng.choice(self.schedules)),
-            traffic_seeds=tuple(int(seed) for seed in seeds),
-            noise_seed=int(rng.integers(10**6, 2 * 10**6)),
-        )
+        return privacy

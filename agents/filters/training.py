@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,21 +27,29 @@ from agents.training.run_files import (
 )
 from dptse_env.estimators.recurrent import read_network, write_network
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE
-from dptse_env.traffic import Records
+from dptse_env.importers.folder import ROAD, new_folder
+from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import FloatArray
 
 WEIGHTS, PLAYED = "network.safetensors", "played.safetensors"
 """The trained network, and the network that the scenarios of a round are collected with."""
-COLUMNS = ("update", "steps", "seconds", "round", "loss", "error", "rate", "validation", "chi2")
+SECTIONS = "sections"
+"""Folder of the sections to validate on."""
+SHOWN_EVERY = 10
+"""Passes after which the learning curve is written."""
+COLUMNS = (
+    "update", "steps", "seconds", "round", "loss", "error", "rate", "validation", "sections",
+    "chi2",
+)  # fmt: skip
 Watcher = Callable[[Row], None]
 
 
 class State(NamedTuple):
-    """The state of k episodes after a second."""
+    """The state of C cells after a second."""
 
-    hidden: Tensor  # (k, S, H)
-    predicted: FloatArray  # of the next second, with deviations, (k, S, 4)
-    age: FloatArray  # seconds since the last measurement of each cell, (k, S)
+    hidden: Tensor  # (C, H)
+    predicted: FloatArray  # of the next second, with deviations, (C, 4)
+    age: FloatArray  # seconds since the last measurement of each cell, (C,)
 
 
 class FilterTraining:
@@ -124,15 +132,15 @@ class FilterTraining:
         return run_in_order(self._executor, work, scenarios, on_done, progress=False)
 
     def _pass(self, index: int, collected: Sequence[Episodes]) -> None:
-        """Pass over some episodes, drawn from all scenarios on a road."""
+        """Pass over some episodes, drawn from all scenarios."""
         started = time.perf_counter()
         plan, rate = self.plan, self.plan.rate(self.done)
         for group in self._optimiser.param_groups:
             group["lr"] = rate
         rng = np.random.default_rng([plan.seed, 2**31, self.done])
         batch = draw_batch(rng, collected, plan.episodes)
-        age = np.full(batch.start.shape[:2], LONGEST_AGE)
-        state = State(torch.zeros(*age.shape, plan.width), batch.start, age)
+        age = np.full(len(batch.start), LONGEST_AGE)
+        state = State(torch.zeros(len(age), plan.width), batch.start, age)
         losses, errors = [], []
         for first in range(0, len(batch.truth), plan.window):
             state, loss, error = self._window(batch, first, state)
@@ -141,7 +149,7 @@ class FilterTraining:
         self.done += 1
         self._seconds += time.perf_counter() - started
         row: Row = {
-            "update": self.done, "steps": self.done * len(batch.truth) * len(batch.start),
+            "update": self.done, "steps": self.done * plan.seconds * plan.episodes,
             "seconds": round(self._seconds, 1), "round": index + 1, "rate": rate,
             "loss": float(np.mean(losses)), "error": float(np.mean(errors[1:] or errors)),
         }  # fmt: skip
@@ -152,23 +160,25 @@ class FilterTraining:
         self._watch(row)
         if is_due:
             self._keep()
+        elif self.done % SHOWN_EVERY == 0 and self.done > plan.checkpoint_every:
+            write_progress(self.folder, self.rows, COLUMNS)
 
     def _window(self, batch: Batch, first: int, state: State) -> tuple[State, float, float]:
         """Update the weights by some seconds; return the state after them, loss and error."""
-        plan, network, road = self.plan, self.network, batch.road
+        plan, network, roads = self.plan, self.network, batch.roads
         seconds = range(first, min(first + plan.window, len(batch.truth)))
         (hidden, predicted, age), kept = state, []
         hidden = hidden.detach()
         for t in seconds:
-            hidden = network(road, batch.channels(t, predicted, age), hidden)
-            predicted = network.read(road, hidden.detach())[1].detach().numpy().astype(float)
+            hidden = network(roads, batch.channels(t, predicted, age), hidden)
+            predicted = network.read(roads, hidden.detach())[1].detach().numpy().astype(float)
             kept.append(hidden)
-        present, ahead = network.read(road, torch.stack(kept))
+        present, ahead = network.read(roads, torch.stack(kept))
         truth, after = (batch.truth[seconds.start + k : seconds.stop + k] for k in (0, 1))
-        loss = second_loss(road, present, truth, plan.likelihood)
-        error = float(second_loss(road, present.detach(), truth, 0.0))
+        loss = second_loss(roads, present, truth, plan.likelihood)
+        error = float(second_loss(roads, present.detach(), truth, 0.0))
         if len(after) > 0:
-            of_next = second_loss(road, ahead[: len(after)], after, plan.likelihood)
+            of_next = second_loss(roads, ahead[: len(after)], after, plan.likelihood)
             loss = loss + plan.prediction * of_next
         self._optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -177,14 +187,28 @@ class FilterTraining:
         return State(hidden, predicted, age), float(loss.detach()), error
 
     def _validate(self) -> Row:
+        """Return mean errors over all cells of a validation, and over those on sections."""
         self._save(WEIGHTS)
-        seeds, rows = self.plan.validation_seeds, list[Mapping[str, Any]]()
-        for cell in self.plan.validation_cells(played_by(self.folder / WEIGHTS)):
-            rows += play(cell, seeds, self._records, threads=None)
-        return {
-            "validation": -float(np.mean([row["reward"] for row in rows])),
-            "chi2": float(np.mean([row["chi2_density"] for row in rows])),
-        }
+        roads, errors, chi2 = self._validation_roads(), list[float](), list[float]()
+        for cell in self.plan.validation_cells(roads, played_by(self.folder / WEIGHTS)):
+            rows = play(cell, cell.seeds or self.plan.validation_seeds, self._records)
+            errors.append(-float(np.mean([row["reward"] for row in rows])))
+            chi2 += [row[f"chi2_{of}"] for row in rows for of in ("density", "speed")]
+        found = {"validation": float(np.mean(errors)), "chi2": float(np.mean(chi2))}
+        if roads:
+            found["sections"] = float(np.mean(errors[-len(roads) :]))
+        return found
+
+    def _validation_roads(self) -> list[Path]:
+        """Return the road files of the sections to validate on, which are written once."""
+        library, roads = open_library(self._records), list[Path]()
+        for section in self.plan.validation_sections():
+            folder = self.folder / SECTIONS / str(section.highway)
+            if not folder.exists():
+                with new_folder(folder) as made:
+                    section.write(made, library)
+            roads.append(folder / ROAD)
+        return roads
 
     def _save(self, name: str) -> None:
         card = self.plan.card(self.done, self.folder.name)

@@ -115,7 +115,7 @@ def world_cell(
     env, changes = {**WORLDS, **ELSEWHERE}[world]
     keywords = {**changes, "estimator": estimator}
     if estimator == LEARNED:
-        keywords["estimator_settings"] = {"recurrent": {"weights": weights, "outside": True}}
+        keywords["estimator_settings"] = {"recurrent": {"weights": weights}}
     return Cell(
         env,
         policy,

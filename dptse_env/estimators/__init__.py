@@ -102,11 +102,22 @@ def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
     """
     check_demand(estimator, settings)
     part = ESTIMATORS.find(estimator)
-    if getattr(part, "steps_model", True):
-        model.require_time_step()
+    if _steps_model(part):
+        try:
+            model.require_time_step()
+        except ValueError as problem:
+            free = ", ".join(name for name in ESTIMATORS if not _steps_model(ESTIMATORS.find(name)))
+            raise ValueError(
+                f"{problem}; or choose other parameters, or an estimator that does not step the "
+                f"model: {free}"
+            ) from problem
     check = getattr(part, "check_settings", None)
     if check is not None:
         check(with_demand(model, settings), settings)
+
+
+def _steps_model(part: Any) -> bool:
+    return bool(getattr(part, "steps_model", True))
 
 
 def with_demand(model: ARZModel, settings: Any) -> ARZModel:

@@ -28,6 +28,7 @@ from dptse_env.estimators.recurrent_kernels import (
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
+from dptse_env.model.network import RoadNetwork
 from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
 from dptse_env.utils.files import read_tensors, require_arrays, write_tensors
 
@@ -73,11 +74,24 @@ class Recurrent(BatchEstimator):
 
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
-        """Refuse weights that are missing, and roads and releases that they do not know."""
-        flows = model.reference_speed is not None
+        """Refuse weights that are missing or cannot be read."""
+        read_network(member_for(settings.recurrent.weights, model.reference_speed is not None))
+
+    @staticmethod
+    def inherits(
+        network: RoadNetwork, flows: bool, largest_span: int, settings: EstimatorSettings
+    ) -> tuple[str, ...]:
+        """Return the setting of the weights where they were trained on other roads or releases.
+
+        Args:
+            network: The road.
+            flows: Whether flows are released, not speeds.
+            largest_span: Largest number of segments of a query.
+            settings: The settings.
+        """
         saved = read_network(member_for(settings.recurrent.weights, flows))
-        if not settings.recurrent.outside:
-            check_ranges(saved, model)
+        is_outside = outside(saved, network, flows, largest_span)
+        return ("estimator_settings.recurrent.weights",) if is_outside else ()
 
     @property
     def means(self) -> FloatArray:
@@ -121,29 +135,21 @@ class Recurrent(BatchEstimator):
         return Estimate(*(self._present[..., j].copy() for j in range(4)))
 
 
-def check_ranges(saved: SavedNetwork, model: ARZModel) -> None:
-    """Refuse a road or a kind of release that a network was not trained on.
-
-    Raises:
-        ValueError: A property lies outside of the card's range; the message names it.
-    """
-    network = model.network
-    found = {
-        "n_mainline": (network.n_mainline, network.n_mainline),
-        "segment_length": (min(network.segment_lengths), max(network.segment_lengths)),
-        "speed_limit": (min(network.speed_limits), max(network.speed_limits)),
-        "lanes": (min(network.segment_lanes), max(network.segment_lanes)),
-        "span": (int(model.rows.span.min()), int(model.rows.span.max())),
-        "flows": (int(model.reference_speed is not None),) * 2,
+def outside(saved: SavedNetwork, network: RoadNetwork, flows: bool, largest_span: int) -> list[str]:
+    """Return the properties of a road and its releases that a network was not trained on."""
+    found: dict[str, Sequence[float]] = {
+        "n_mainline": (network.n_mainline,),
+        "segment_length": network.segment_lengths,
+        "speed_limit": network.speed_limits,
+        "lanes": network.segment_lanes,
+        "span": (largest_span,),
+        "flows": (flows,),
     }
-    for name, bounds in saved.card["ranges"].items():
-        low, high = found.get(name, bounds)
-        if not bounds[0] <= low <= high <= bounds[1]:
-            raise ValueError(
-                f"estimator_settings.recurrent.weights {saved.source!r} were trained on {name} in "
-                f"[{bounds[0]:g}, {bounds[1]:g}], this environment has [{low:g}, {high:g}]; choose "
-                "others, or set estimator_settings.recurrent.outside to true"
-            )
+    return [
+        name
+        for name, (low, high) in saved.card["ranges"].items()
+        if not all(low <= value <= high for value in found.get(name, ()))
+    ]
 
 
 @dataclass(frozen=True)

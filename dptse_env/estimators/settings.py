@@ -139,12 +139,11 @@ class RecurrentSettings(_Checked, path=f"{_PATH}.recurrent"):
     Attributes:
         weights: Name of a network that ships with the package, or a file. A pair of networks, one
             for releases of flows and one for releases of speeds, goes by the name that they share:
-            ``highway`` stands for ``highway-flows`` or ``highway-speeds``.
-        outside: Whether to take a network for roads and releases outside of the ranges on its card.
+            ``highway`` stands for ``highway-flows`` or ``highway-speeds``. Outside of the ranges on
+            its card a network is used with a warning, and ``info["inherited"]`` names it.
     """
 
     weights: str = "highway"
-    outside: bool = False
 
 
 @dataclass(frozen=True)

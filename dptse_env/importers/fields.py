@@ -29,6 +29,7 @@ from dptse_env.utils.fields import (
     Interval,
     cut,
     integer,
+    non_negative,
     number,
     positive,
     require,
@@ -54,6 +55,9 @@ FEW = 0.01
 """Share of the cells that may be beyond these limits, by noise; more tell of another unit."""
 SLOW = 0.4
 """Share of the limit that vehicles exceed where they drive freely."""
+WAVE, WAVE_LENGTH = 18.0, 0.1
+"""Speed [km/h] at which waves of congested traffic run upstream, and the way [km] by which it is
+told that they do."""
 LARGEST_NUMBER = 1e6
 """Largest number in a file, in its unit."""
 LONGEST_FIELD = 31 * 86_400
@@ -63,6 +67,8 @@ LONGEST_FIELD = 31 * 86_400
 @dataclass(frozen=True)
 class FieldSource:
     """A field in text files with a row for each cell and a column for each interval.
+
+    A missing value is ``nan``, or nothing between two delimiters. An empty cell needs no speed.
 
     Attributes:
         density: File of densities.
@@ -76,6 +82,7 @@ class FieldSource:
         transposed: Whether rows are intervals.
         reversed: Whether the first cell is the last downstream.
         delimiter: What separates the numbers of a line; None for blanks.
+        longest_gap: Longest time without a value that is filled by interpolation [s].
     """
 
     density: Path
@@ -89,6 +96,7 @@ class FieldSource:
     transposed: bool = False
     reversed: bool = False
     delimiter: str | None = None
+    longest_gap: float = 60.0
 
     def read(self, lanes: int, speed_limit: float) -> tuple[FloatArray, FloatArray]:
         """Return density [veh/km] and flow [veh/h], of shape (cells, intervals), from upstream on.
@@ -98,24 +106,28 @@ class FieldSource:
             speed_limit: Its speed limit [km/h].
 
         Raises:
-            ValueError: A file is no table of numbers, the files do not fit one another, or a unit
-                is unknown or not that of the data; the message has the file, and the units that
-                the data may have.
+            ValueError: A file is no table of numbers or has a long gap, the files do not fit one
+                another, or a unit is unknown or not that of the data; the message has the file,
+                and the units that the data may have.
             OSError: A file cannot be read.
 
         Warns:
-            UserWarning: All speeds are low, which congestion may explain, or another unit.
+            UserWarning: Gaps were filled; queues move downstream; all speeds are low, which
+                congestion may explain, or another unit.
         """
         number(float, self.cell, "cell", Interval(0.001, 10))
         number(float, self.interval, "interval", Interval(0.01, 3600))
         integer("lanes", lanes, 1)
         positive("speed_limit", speed_limit)
         require((self.speed is None) != (self.flow is None), "speed", "given, or else flow", None)
+        non_negative("longest_gap", self.longest_gap)
         density = self._table("density")
         kind = "speed" if self.flow is None else "flow"
         path, other = getattr(self, kind), self._table(kind)
         allowed = f"a table of {self.density}'s shape {density.shape}"
         require(other.shape == density.shape, str(path), allowed, other.shape)
+        other = np.where(np.isnan(other) & (density == 0.0), 0.0, other)
+        density, other = self._filled("density", density), self._filled(kind, other)
         lasts = density.shape[1] * self.interval
         allowed = f"a field of at most {LONGEST_FIELD} s, at {self.interval:g} s a column"
         require(lasts <= LONGEST_FIELD, str(self.density), allowed, f"{lasts:g} s")
@@ -131,6 +143,7 @@ class FieldSource:
                 f"{path}: flow must be at most {most:g} veh/h on {lanes} lanes: check the units "
                 f"and lanes, got {flow.max():.4g} veh/h"
             )
+        self._check_direction(density, bool(np.median(speed) < 0.5 * speed_limit))
         if speed.size and speed.max() < SLOW * speed_limit:
             warnings.warn(
                 f"no speed of the field is above {speed.max():.0f} km/h, at a limit of "
@@ -156,6 +169,62 @@ class FieldSource:
             f"{' or '.join(likely) or 'none that is known'}, got {given!r}: {problem}"
         )
 
+    def _check_direction(self, density: FloatArray, is_congested: bool) -> None:
+        """Warn where the waves of congested traffic run downstream: they run upstream anywhere."""
+        per_interval = WAVE * self.interval / 3600.0
+        lag = int(np.ceil(WAVE_LENGTH / per_interval))
+        away = round(lag * per_interval / self.cell)
+        cells, intervals = density.shape
+        if not (is_congested and 0 < away <= cells // 2 and lag <= intervals // 4):
+            return
+        rest = density - density.mean(axis=1, keepdims=True)
+        early, late = rest[:, :-lag], rest[:, lag:]
+        upstream = (early[away:] * late[:-away]).sum()
+        downstream = (early[:-away] * late[away:]).sum()
+        if downstream - upstream > 0.1 * (rest**2).sum():
+            warnings.warn(
+                f"{self.density}: queues of this field move downstream, and real ones upstream: "
+                "should reversed be turned round?",
+                stacklevel=4,
+            )
+
+    def _filled(self, kind: str, table: FloatArray) -> FloatArray:
+        """Return a table (cells, intervals) whose gaps in time are filled, or refuse long ones."""
+        missing = np.isnan(table)
+        if not missing.any():
+            return table
+        path, most = getattr(self, kind), max(1, int(self.longest_gap // self.interval))
+        table = table.copy()
+        columns = np.arange(table.shape[1])
+        for cell in np.flatnonzero(missing.any(axis=1)):
+            edges = np.flatnonzero(np.diff(missing[cell], prepend=False, append=False))
+            for start, stop in edges.reshape(-1, 2).tolist():
+                if stop - start > most:
+                    raise ValueError(self._gap(path, int(cell), start, stop, table.shape))
+            known = ~missing[cell]
+            table[cell] = np.interp(columns, columns[known], table[cell, known])
+        warnings.warn(
+            f"{path}: {missing.sum()} of {missing.size} values are missing, and interpolated in "
+            f"time; no gap is longer than {most} interval(s)",
+            stacklevel=4,
+        )
+        return table
+
+    def _gap(self, path: Path, cell: int, start: int, stop: int, shape: tuple[int, ...]) -> str:
+        """Return what is wrong with a gap, in rows and columns of the file."""
+        row = shape[0] - 1 - cell if self.reversed else cell
+        names = ("column", "row") if self.transposed else ("row", "column")
+        if stop - start == shape[1]:
+            return (
+                f"{path}: {names[0]} {row + 1} must have values, got none: leave out cells without "
+                "a detector, in all files, or fill them"
+            )
+        return (
+            f"{path}: {names[0]} {row + 1} must have a value every {self.longest_gap:g} s, got "
+            f"none from {names[1]} {start + 1} to {stop}: fill them, leave this time out in all "
+            f"files, or let longest_gap be {self.interval * (stop - start):g} s or more"
+        )
+
     def _table(self, kind: str) -> FloatArray:
         path, unit = getattr(self, kind), getattr(self, f"{kind}_unit")
         require_name(f"{kind}_unit", unit, UNITS[kind])
@@ -163,17 +232,23 @@ class FieldSource:
             raise ValueError(f"{path} must be a file, got a directory")
         try:
             with path.open(encoding="utf-8-sig") as file:
-                table = np.loadtxt(file, ndmin=2, delimiter=self.delimiter)
+                table = np.loadtxt(
+                    file, ndmin=2, delimiter=self.delimiter, converters=_number_or_nan
+                )
         except ValueError as problem:
             raise ValueError(f"{path} must be a table of numbers: {cut(problem)}") from problem
         require(table.size > 0, str(path), "a table of at least one number", table.shape)
-        for row, column in np.argwhere(~((table >= 0.0) & (table <= LARGEST_NUMBER)))[:1]:
+        for row, column in np.argwhere((table < 0.0) | (table > LARGEST_NUMBER))[:1]:
             raise ValueError(
                 f"{path}: row {row + 1}, column {column + 1} must be in [0, {LARGEST_NUMBER:g}], "
-                f"got {table[row, column]}"
+                f"or nan where it is missing, got {table[row, column]}"
             )
         table = UNITS[kind][unit] * (table.T if self.transposed else table)
         return table[::-1] if self.reversed else table
+
+
+def _number_or_nan(text: str) -> float:
+    return float(text) if text.strip() else np.nan
 
 
 def _odd_density(density: FloatArray, lanes: int) -> str | None:

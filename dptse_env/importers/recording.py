@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from dptse_env.importers import tables
+from dptse_env.importers import tables, units
 from dptse_env.importers.placing import OFF, Road, part_in_words, placed
 from dptse_env.importers.resampling import TIME_UNIT, check_pieces, count_ends, whole_seconds
 from dptse_env.importers.source import Source, TrajectoryError
@@ -76,6 +76,7 @@ class Recording:
         shift: What is added to the file's times [s].
         speed_ratio: Given speeds over those that positions say; None without speeds.
         off_names: Names of lanes or edges that are not on the road, some of them.
+        recognised: Units that the points tell and nobody gave, in words.
     """
 
     path: Path
@@ -89,6 +90,7 @@ class Recording:
     shift: float = 0.0
     speed_ratio: float | None = None
     off_names: list[str] = field(default_factory=list)
+    recognised: str = ""
 
     def __post_init__(self) -> None:
         """Read the file and keep its windows in `folder`.
@@ -142,9 +144,16 @@ class Recording:
     def _spool(self) -> int:
         """Place the points of the file and write them to buckets; return the number of these."""
         layout, c = self.source.layout, pl.col
-        unit = self.source.factor("length", self._form.units["length"])
         try:
             points, roles, n_rows = tables.scan(self.path, self._form, self.source)
+            sample = points.head(units.SAMPLE).collect(engine="streaming")
+            length = float(self.road.faces[-1])
+            known = units.choose(sample, self.source, self._units, length, str(self.path))
+            if known is not self.source:
+                self.recognised = units.in_words(known, self.source)
+                self.source, self._units = known, {**self._units, **known.units}
+                points, roles, n_rows = tables.scan(self.path, self._form, self.source)
+            unit = self.source.factor("length", self._form.units["length"])
             n_buckets = min(1 + n_rows // BUCKET_ROWS, MOST_BUCKETS)
             points = placed(points, roles, self.road, layout, unit).select(
                 "row", "time", "vehicle", "position", "speed", "branch", "column", "lane_number",

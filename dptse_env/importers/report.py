@@ -92,6 +92,7 @@ def _file(recording: Recording) -> dict[str, Any]:
         "bytes": recording.path.stat().st_size,
         "windows": len(recording.windows),
         "speed_ratio": None if ratio is None else round(ratio, 4),
+        "recognised": recording.recognised,
         "off_the_road": recording.off_names,
         **{name: int(recording.counts[name]) for name in names},
     }
@@ -113,6 +114,8 @@ def _markdown(content: Mapping[str, Any]) -> str:
     )
     for file in content["files"]:
         parts.append(f"## {file['file']}")
+        if file["recognised"]:
+            parts.append(f"\nRecognised, since nobody gave it: {file['recognised']}.")
         for title, told in _COUNTS.items():
             parts.append(f"\n| {title} | |\n| --: | :-- |")
             parts += [f"| {file[key]} | {words} |" for key, words in told.items()]

@@ -11,6 +11,7 @@ import polars as pl
 
 from dptse_env.importers.placing import Road
 from dptse_env.importers.source import LENGTHS, SPEEDS, TrajectoryError
+from dptse_env.importers.units import FASTEST_ROAD, SLOWEST_ROAD, TOLERANCE
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 TIME_UNIT = 1e-4
@@ -23,10 +24,6 @@ SAME_PLACE = 0.005
 """Largest distance between two points that count as duplicates [km]."""
 HALF_WIDTH = 0.5
 """A derived speed is the mean over this time [s] on both sides."""
-TOLERANCE = 1.25
-"""Largest factor between speeds and what positions say of them."""
-SLOWEST_ROAD, FASTEST_ROAD = 1.0, 250.0
-"""Median speeds [km/h] of the vehicles that move furthest, beyond which a unit is wrong."""
 
 
 def whole_seconds(

@@ -93,16 +93,27 @@ class ARZParameters:
         return min(forwards, crossing / self.gamma)
 
     def require_time_step(self, time_step: float, segment_length: float) -> None:
-        """Refuse a time step [s] that violates the CFL condition on a segment [km]."""
+        """Refuse a time step [s] that violates the CFL condition on a segment [km].
+
+        Raises:
+            ValueError: It does; the message has the shortest segment of this time step, if any.
+        """
         largest = self.largest_time_step(segment_length)
-        if not 0.0 < time_step <= largest:
-            # Rounded down, so that the number in the message is admissible.
-            named = math.floor(100.0 * largest) / 100.0
-            raise ValueError(
-                f"corridor.segment_length must be longer for the parameters {self.name!r}: on "
-                f"{segment_length:g} km their CFL condition needs a time step > 0 and at most "
-                f"{named:.2f} s, got {time_step:g} s"
-            )
+        if 0.0 < time_step <= largest:
+            return
+        # Rounded so that the numbers in the message are admissible.
+        named = math.floor(100.0 * largest) / 100.0
+        share = 1.0 - time_step / self.relaxation_time
+        allowed = "longer"
+        if time_step > 0.0 and share > 0.0:
+            waves = max(LARGEST_W / share, self.gamma) * self.free_flow_speed
+            least = math.ceil(1e4 * time_step * waves / SECONDS_PER_HOUR) / 1e4
+            allowed = f"at least {least:g} km"
+        raise ValueError(
+            f"corridor.segment_length must be {allowed} for the parameters {self.name!r}, got "
+            f"{segment_length:g} km: there their CFL condition needs a time step > 0 and at most "
+            f"{named:.2f} s, got {time_step:g} s"
+        )
 
 
 @cache

@@ -1,6 +1,8 @@
 """Scenarios, what is collected of them, the network with gradients, and its training."""
 
 import dataclasses
+import json
+from itertools import product
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ torch = pytest.importorskip("torch")
 
 from agents.environments import make_config, make_vector, parse_env  # noqa: E402
 from agents.filters.collecting import Batch, collect, draw_batch  # noqa: E402
+from agents.filters.highways import LENGTHS, LIMITS, Section, draw_highway  # noqa: E402
 from agents.filters.network import RecurrentNetwork, second_loss  # noqa: E402
 from agents.filters.plan import OWN, FilterPlan, Round, played_by  # noqa: E402
 from agents.filters.scenarios import MECHANISMS, ROADS, SCHEDULES, ScenarioRanges  # noqa: E402
@@ -17,20 +20,25 @@ from agents.training.run_files import read_progress  # noqa: E402
 from dptse_env.estimators.recurrent import read_network, write_network  # noqa: E402
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE  # noqa: E402
 from dptse_env.evaluation import evaluate  # noqa: E402
+from dptse_env.traffic import RecordLibrary, read_corridor  # noqa: E402
 from tests.agents.elsewhere import Elsewhere  # noqa: E402
 from tests.estimators.helpers import card  # noqa: E402
 from tests.helpers import SHORT  # noqa: E402
 
-RANGES = ScenarioRanges(envs=(SHORT,), spans=((1,), (1, 2)))
+RANGES = ScenarioRanges(envs=(SHORT,), sections=0.0, spans=((1,), (1, 2)))
 PLAN = FilterPlan(
+    kind="flows",
     seed=3,
     traffic_seeds=(0, 1, 2),
     validation_seeds=(1000, 1001),
     validation_envs=(SHORT,),
+    validation_highways=(1000, 1000),
     ranges=RANGES,
     rounds=(Round("ekf", 1, 1), Round(OWN, 2, 3)),
     width=4,
+    windows=2,
     episodes=2,
+    seconds=240,
     checkpoint_every=2,
 )
 WALK = {"estimator": "random_walk"}
@@ -44,40 +52,112 @@ def _one_thread():
 # Scenarios ----------------------------------------------------------------------------------------
 
 
-def drawn(ranges=RANGES, n=60, seed=0):
+def drawn(ranges=RANGES, n=60, seed=0, kind="flows", on_section=False):
     rng = np.random.default_rng(seed)
-    return [ranges.draw(rng, range(20), 4) for _ in range(n)]
+    return [ranges.draw(rng, kind, range(20), 4, 240, on_section) for _ in range(n)]
 
 
 def test_scenarios_cover_their_ranges():
     scenarios = drawn(n=200)
     privacy = [each.keywords["privacy"] for each in scenarios]
-    assert {each["preset"] for each in privacy} == set(MECHANISMS)
+    assert {each["preset"] for each in privacy} == set(MECHANISMS["flows"])
     assert {each.schedule for each in scenarios} == set(SCHEDULES)
     epsilons = np.array([each["epsilon"] for each in privacy])
     assert 0.5 <= epsilons.min() < 0.7
     assert 14.0 < epsilons.max() <= 20.0
     assert 0.3 < np.mean(epsilons < np.sqrt(0.5 * 20.0)) < 0.7  # even in the logarithm
-    assert {each.keywords["bandwidth"] for each in scenarios} == set(range(1, 7))
+    bandwidths = [each.keywords["bandwidth"] for each in scenarios]
+    assert set(bandwidths) == set(range(1, 7))
+    assert bandwidths.count(1) > 2 * bandwidths.count(6)
     assert any("query_spans" in each.keywords for each in scenarios)
     for each in scenarios:
         assert len(set(each.traffic_seeds)) == 4
         assert set(each.traffic_seeds) <= set(range(20))
-    few = dataclasses.replace(RANGES, largest_share=0.35, mechanisms=("capped",))
-    assert {each.keywords["bandwidth"] for each in drawn(few)} == {1, 2}
-    assert {each.keywords["privacy"]["preset"] for each in drawn(few)} == {"capped"}
     assert drawn(n=5) == drawn(n=5) != drawn(n=5, seed=1)
+    presets = {each.keywords["privacy"]["preset"] for each in drawn(kind="speeds")}
+    assert presets == set(MECHANISMS["speeds"])
 
 
 @pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
 def test_every_scenario_is_an_environment_and_every_road_another_one():
-    for env in ROADS:
-        for scenario in drawn(dataclasses.replace(RANGES, envs=(env,)), n=4):
+    for env, kind in product(ROADS, MECHANISMS):
+        for scenario in drawn(dataclasses.replace(RANGES, envs=(env,)), n=2, kind=kind):
             config = make_config(scenario.env, scenario.keywords)
             assert config.bandwidth <= config.corridor.n_mainline
             assert config.privacy.preset == scenario.keywords["privacy"]["preset"]
+            assert config.horizon == 240
     digests = {make_config(*parse_env(each)).corridor.digest for each in ROADS}
     assert len(digests) == len(ROADS)
+
+
+# Sections -----------------------------------------------------------------------------------------
+
+
+def test_highways_differ_in_everything_that_roads_differ_in():
+    highways = [draw_highway(number) for number in range(100)]
+    lanes = {count for each in highways for count in each.segment_lanes}
+    assert lanes == set(range(1, 7))
+    limits, lengths = (
+        [value for each in highways for value in getattr(each, name)]
+        for name in ("speed_limits", "segment_lengths")
+    )
+    assert (min(limits), max(limits)) == LIMITS
+    assert LENGTHS[0] <= min(lengths) < 0.06
+    assert 0.2 < max(lengths) <= LENGTHS[1]
+    assert {each.drivers.model for each in highways} == {"W99", "IDM", "Krauss"}
+    assert {0, 6} <= {each.n_ramps for each in highways}
+    least = [min(rate for _, rate in each.published_demand.mainline) for each in highways]
+    assert min(least) < 300.0
+    assert draw_highway(3) == draw_highway(3) != draw_highway(4)
+
+
+@pytest.fixture(scope="module")
+def night():
+    """A highway that is quick to simulate, with both kinds of ramps."""
+    return next(
+        number
+        for number in range(1000)
+        if draw_highway(number).n_on_ramps
+        and draw_highway(number).n_off_ramps
+        and draw_highway(number).published_demand.mainline[0][1] < 1000.0
+    )
+
+
+@pytest.mark.parametrize("averaged", [0, 5])
+def test_a_section_has_the_vehicles_of_its_highway(night, averaged, tmp_path):
+    library, highway = RecordLibrary(), draw_highway(night)
+    section = Section(night, highway.n_mainline - 2, 2, 100, averaged=averaged, seed=1)
+    road = read_corridor(section.write(tmp_path, library))
+    assert road.on_ramps == tuple(face - 1 for face in highway.on_ramps)
+    assert road.segment_lengths[0] == highway.segment_lengths[0]
+    assert road.published_demand.mainline[0][1] > 0.0
+    start = json.loads((tmp_path / "manifest.json").read_text())["sources"][1]["start"]
+    whole, cut = library.get(highway, 0), library.get(road, 1)
+    n, times = road.n_mainline, slice(start, start + 101)
+    counts = np.concatenate(
+        [
+            whole.counts[times, 1 : n + 1],
+            whole.counts[times, highway.n_mainline : highway.n_segments],
+            whole.counts[times, [0, n + 1]],
+            whole.counts[times, highway.n_segments + 2 :],
+        ],
+        axis=1,
+    )
+    if not averaged:
+        np.testing.assert_array_equal(cut.counts, counts)
+        return
+    lengths = np.array(road.with_boundaries(road.segment_lengths))
+    around = np.stack([counts[k - 2 : k + 3].mean(axis=0) for k in range(2, 99)])
+    np.testing.assert_allclose(cut.field[2:-2, :, 0], around / lengths, atol=1e-9)
+
+
+def test_scenarios_on_sections_are_played(night):
+    ranges = dataclasses.replace(RANGES, highways=(night, night + 1))
+    for kind in MECHANISMS:
+        (scenario,) = drawn(ranges, n=1, kind=kind, on_section=True)
+        collected = collect(scenario, WALK, None)
+        assert collected.truth.shape[:2] == (240, 4)
+        assert collected.corridor.n_mainline == scenario.section.segments
 
 
 # Episodes -----------------------------------------------------------------------------------------
@@ -103,21 +183,24 @@ class Seen:
 
 def steps(network, batch, n):
     """Yield hidden states and what the network says of the second, for `n` seconds."""
-    age, predicted = np.full(batch.start.shape[:2], LONGEST_AGE), batch.start
-    hidden = torch.zeros(*age.shape, network.width)
+    age, predicted = np.full(len(batch.start), LONGEST_AGE), batch.start
+    hidden = torch.zeros(len(age), network.width)
     for t in range(n):
         with torch.no_grad():
-            hidden = network(batch.road, batch.channels(t, predicted, age), hidden)
-            present, ahead = network.read(batch.road, hidden)
+            hidden = network(batch.roads, batch.channels(t, predicted, age), hidden)
+            present, ahead = network.read(batch.roads, hidden)
         predicted = ahead.numpy().astype(float)
         yield hidden.numpy(), present.numpy()
 
 
-def mixed(mechanisms, index):
-    ranges = dataclasses.replace(PLAN.ranges, mechanisms=mechanisms, spans=((1, 2),))
-    return dataclasses.replace(PLAN, ranges=ranges, rounds=(Round("ekf", 2, 1),)).scenarios(0)[
-        index
-    ]
+def mixed(mechanism, env=SHORT):
+    """Return a scenario with a release model."""
+    kind = next(kind for kind, known in MECHANISMS.items() if mechanism in known)
+    ranges = dataclasses.replace(PLAN.ranges, envs=(env,), spans=((1, 2),))
+    plan = dataclasses.replace(PLAN, kind=kind, ranges=ranges, rounds=(Round("ekf", 20, 1),))
+    return next(
+        each for each in plan.scenarios(0) if each.keywords["privacy"]["preset"] == mechanism
+    )
 
 
 @pytest.mark.parametrize("mechanism", ["paper", "paced"])
@@ -128,7 +211,7 @@ def test_the_network_with_gradients_is_the_estimator(mechanism, tmp_path):
     with torch.no_grad():
         network.heads.normal_(0.0, 0.5)
     write_network(tmp_path / "network.safetensors", network.weights(), card())
-    own, scenario = played_by(tmp_path / "network.safetensors"), mixed((mechanism,), 0)
+    own, scenario = played_by(tmp_path / "network.safetensors"), mixed(mechanism)
     collected = collect(scenario, own, None)
     keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.traffic_seeds)}
     env, seen = make_vector(SHORT, 2, {**keywords, "action": "scores"}), Seen()
@@ -136,53 +219,62 @@ def test_the_network_with_gradients_is_the_estimator(mechanism, tmp_path):
     evaluate(env, scenario.schedule, seeds, noise, watchers=[seen.begin])
     batch, T = Batch([collected.pick(np.arange(2))]), collected.corridor.duration
     for (_, present), estimate in zip(steps(network, batch, T), seen.estimates[1:], strict=True):
-        np.testing.assert_allclose(present[..., 0], estimate.density, rtol=2e-4, atol=2e-3)
-        np.testing.assert_allclose(present[..., 3], estimate.speed_std, rtol=2e-3)
+        said = present.reshape(*estimate.density.shape, 4)
+        np.testing.assert_allclose(said[..., 0], estimate.density, rtol=2e-4, atol=2e-3)
+        np.testing.assert_allclose(said[..., 3], estimate.speed_std, rtol=2e-3)
     np.testing.assert_allclose(collected.truth, np.array(seen.truth[1:]), rtol=1e-6)
 
 
-def test_a_batch_mixes_the_scenarios_of_a_road():
-    """Releases of speeds and of flows, of single cells and of sums."""
-    singles, sums = (
-        collect(mixed((mechanism,), k), WALK, None)
-        for k, mechanism in enumerate(("paper", "paced"))
-    )
-    assert singles.observed.shape[2] < sums.observed.shape[2]
+LONGER = f'{SHORT} {{"corridor": {{"n_mainline": 9}}}}'
+
+
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+def test_a_batch_mixes_scenarios_of_any_roads():
+    """Releases of speeds and of flows, of single cells and of sums, on two roads."""
+    singles, sums = collect(mixed("paper"), WALK, None), collect(mixed("paced", LONGER), WALK, None)
+    assert singles.cells.lanes.size + 3 == sums.cells.lanes.size
     batch = Batch([singles.pick(np.array([1])), sums.pick(np.array([0, 1]))])
-    np.testing.assert_array_equal(batch.truth[:, 0], singles.truth[:, 1])
+    n = singles.cells.lanes.size
+    np.testing.assert_array_equal(batch.truth[:, :n], singles.truth[:, 1])
     network = RecurrentNetwork(4)
-    alone = [steps(network, Batch([each.pick(np.arange(2))]), 20) for each in (singles, sums)]
+    alone = [
+        steps(network, Batch([each.pick(chosen)]), 20)
+        for each, chosen in ((singles, np.array([1])), (sums, np.arange(2)))
+    ]
     for (together, _), (one, _), (two, _) in zip(steps(network, batch, 20), *alone, strict=True):
-        np.testing.assert_allclose(together, np.stack([one[1], *two]), atol=1e-5)
+        np.testing.assert_allclose(together, np.concatenate([one, two]), atol=1e-5)
 
 
-def test_batches_are_drawn_from_all_scenarios_of_a_road():
-    collected = [collect(mixed(("paper",), k), WALK, None) for k in range(2)]
+def test_batches_are_drawn_from_all_scenarios():
+    collected = [collect(mixed("paper"), WALK, None), collect(mixed("corrected"), WALK, None)]
     starts = {float(each.truth[:, k].sum()): 0 for each in collected for k in range(2)}
-    rng, n_drawn = np.random.default_rng(0), 0
+    rng, n_drawn, size = np.random.default_rng(0), 0, collected[0].cells.lanes.size
     for _ in range(30):
         batch = draw_batch(rng, collected, 3)
-        for episode in batch.truth.swapaxes(0, 1).numpy():
-            starts[min(starts, key=lambda total: abs(total - float(episode.sum())))] += 1
+        assert batch.roads.n_episodes == 3
+        for first in range(0, 3 * size, size):
+            total = float(batch.truth[:, first : first + size].sum())
+            starts[min(starts, key=lambda known: abs(known - total))] += 1
             n_drawn += 1
-        assert len(batch.start) == 3
     assert n_drawn == 90
     assert min(starts.values()) > 0
 
 
 def test_the_loss_is_the_environments_error():
-    collected = collect(mixed(("paced",), 0), WALK, None)
+    """The mean over episodes, however many cells they have."""
+    collected = collect(mixed("paced"), WALK, None)
     batch, corridor = Batch([collected.pick(np.arange(2))]), collected.corridor
-    road, truth = batch.road, batch.truth
+    roads, truth = batch.roads, batch.truth
     estimated = torch.cat([truth, torch.ones_like(truth)], -1)
-    assert float(second_loss(road, estimated, truth, 0.0)) == pytest.approx(1e-4)
+    assert float(second_loss(roads, estimated, truth, 0.0)) == pytest.approx(1e-4)
     off = estimated + torch.tensor([corridor.density_scale * 0.1, 0.0, 0.0, 0.0])
-    occupied = (truth[:, :, : corridor.n_mainline, 0] > 0).float()
+    by_episode = truth.reshape(len(truth), 2, -1, 2)
+    occupied = (by_episode[:, :, : corridor.n_mainline, 0] > 0).float()
     share = corridor.n_mainline / (corridor.n_mainline + occupied.sum(-1))
     expected = float((0.1 * share.sqrt()).mean())
-    assert float(second_loss(road, off, truth, 0.0)) == pytest.approx(expected, 1e-3)
+    assert float(second_loss(roads, off, truth, 0.0)) == pytest.approx(expected, 1e-3)
     wide = estimated * torch.tensor([1.0, 1.0, 50.0, 50.0])
-    assert second_loss(road, wide, truth, 1.0) > second_loss(road, estimated, truth, 1.0)
+    assert second_loss(roads, wide, truth, 1.0) > second_loss(roads, estimated, truth, 1.0)
 
 
 # Training -----------------------------------------------------------------------------------------
@@ -237,7 +329,7 @@ def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_p
     first.run()
     ranges = read_network(str(path)).card["ranges"]
     assert ranges["span"] == [1.0, 2.0]
-    assert ranges["flows"] == [0.0, 1.0]
+    assert ranges["flows"] == [1.0, 1.0]
     assert ranges["n_mainline"] == [6, 6]
     plan = dataclasses.replace(PLAN, initial=str(path), rounds=(Round(OWN, 1, 1),), seed=5)
     second = FilterTraining(plan, tmp_path / "b")
@@ -259,7 +351,9 @@ def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_p
         ({"validation_seeds": (5,)}, r"validation must be traffic seeds in 1000\.\.1999, got 5"),
         ({"rounds": (Round(OWN, 1, 1),)}, "rounds must begin with one of another estimator"),
         ({"rounds": ()}, "rounds must begin"),
-        ({"episodes": 4}, r"episodes must be an integer in 1\.\.3, got 4"),
+        ({"windows": 4}, r"windows must be an integer in 1\.\.3, got 4"),
+        ({"kind": "densities"}, "kind must be one of 'flows', 'speeds', got 'densities'"),
+        ({"validation_highways": (5, 9)}, r"validation_highways must be .* outside of \(0, 80\)"),
         ({"initial": "nowhere"}, r"weights must be a file or one of highway, .*, got 'nowhere'"),
     ],
 )
@@ -273,7 +367,6 @@ def test_bad_plans_are_named(changes, message):
     [
         ({"rounds": (Round("kalman", 1, 1),)}, "kalman"),
         ({"ranges": dataclasses.replace(RANGES, schedules=("best",))}, "best"),
-        ({"ranges": dataclasses.replace(RANGES, mechanisms=("none",))}, "none"),
         ({"validation_envs": (f'{SHORT} {{"bandwidth": 99}}',)}, "bandwidth"),
     ],
 )

@@ -33,7 +33,7 @@ FIELDS = ("density", "speed", "density_std", "speed_std")
 REFERENCE_SPEED = 51.0
 # The noise of a flow is v_0 times the density's where both get the same share of the privacy.
 SPEEDS, FLOWS = np.array([15.0, 6.0]), np.array([15.0, 15.0 * REFERENCE_SPEED])
-PLAIN = EstimatorSettings(recurrent=RecurrentSettings(outside=True))  # rows of three segments
+PLAIN = EstimatorSettings()
 RICH = EstimatorSettings(density_growth=0.03, count_noise=0.5, demand=DemandSettings())
 
 
@@ -270,8 +270,8 @@ def card(**ranges):
     }
 
 
-def network_settings(folder, network=None, outside=False, **ranges):
+def network_settings(folder, network=None, **ranges):
     """Settings of a network that is written into a folder."""
     path = folder / "network.safetensors"
     write_network(path, network or random_network(), card(**ranges))
-    return EstimatorSettings(recurrent=RecurrentSettings(weights=str(path), outside=outside))
+    return EstimatorSettings(recurrent=RecurrentSettings(weights=str(path)))

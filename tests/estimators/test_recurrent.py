@@ -8,6 +8,7 @@ import pytest
 from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent import (
     member_for,
+    outside,
     read_network,
     shipped_networks,
     write_network,
@@ -19,6 +20,7 @@ from dptse_env.estimators.recurrent_kernels import (
     LOWEST_SPREAD,
     make_cells,
 )
+from dptse_env.traffic import PAPER_HIGHWAY
 from tests.hostile import check_hostile, edited
 
 from .helpers import card, network_settings, random_network, run, simulate, started, step
@@ -98,13 +100,20 @@ class Twin:
         self.model, cells, n = estimator.model, estimator.cells, estimator.n_episodes
         self.network = trained.RecurrentNetwork(estimator.saved.network.width)
         self.network.take(estimator.saved.network)
-        upstream = torch.zeros(2 * (self.model.n_segments,))
-        upstream[cells.edges[:, 1], cells.edges[:, 0]] = 1.0
-        unit, n_mainline = torch.from_numpy(cells.unit), self.model.network.n_mainline
-        self.road = trained.Road(unit, cells.limit, upstream, (1.0, 1.0), n_mainline)
+        S = self.model.n_segments
+        edges = cells.edges + S * np.arange(n)[:, None, None]
+        self.roads = trained.Roads(
+            torch.from_numpy(np.tile(cells.unit, n)),
+            torch.full((n * S,), cells.limit),
+            torch.from_numpy(edges.reshape(-1, 2)),
+            torch.ones(n * S, 2),
+            torch.ones(n * S),
+            torch.arange(n).repeat_interleave(S),
+            n,
+        )
         said = estimator.estimate()
         self.ahead = np.stack([said.density, said.speed, said.density_std, said.speed_std], -1)
-        self.hidden = torch.zeros(n, self.model.n_segments, self.network.width)
+        self.hidden = torch.zeros(n * S, self.network.width)
         self.age = np.full(self.ahead.shape[:2], LONGEST_AGE)
 
     def step(self, inputs, given):
@@ -115,10 +124,10 @@ class Twin:
         ]
         x, self.innovations = (np.stack(each) for each in zip(*both, strict=True))
         with torch.no_grad():
-            self.hidden = self.network(self.road, torch.from_numpy(x), self.hidden)
-            present, ahead = self.network.read(self.road, self.hidden)
-        self.ahead = ahead.numpy()
-        return present.numpy(), self.ahead
+            self.hidden = self.network(self.roads, torch.from_numpy(x).flatten(0, 1), self.hidden)
+            present, ahead = self.network.read(self.roads, self.hidden)
+        self.ahead = ahead.numpy().reshape(self.ahead.shape)
+        return present.numpy().reshape(self.ahead.shape), self.ahead
 
 
 @pytest.fixture
@@ -147,7 +156,8 @@ def test_it_is_the_network_that_is_trained(release, width, noise, tmp_path):
         step(estimator, episodes, k)
         given = Measurement.of(episodes.model, **episodes.released(k, episodes.everyone))
         present, ahead = twin.step(episodes.inputs[k], given)
-        np.testing.assert_allclose(estimator.hidden, twin.hidden, atol=1e-5)
+        hidden = twin.hidden.reshape(estimator.hidden.shape)
+        np.testing.assert_allclose(estimator.hidden, hidden, atol=1e-5)
         np.testing.assert_allclose(estimator.means, present[..., :2], rtol=1e-5, atol=1e-3)
         said = estimator.estimate()
         np.testing.assert_allclose(said.density_std, present[..., 2], rtol=1e-4)
@@ -195,16 +205,16 @@ def test_deviations_and_estimates_stay_in_their_range(tmp_path):
     np.testing.assert_allclose(estimate.density_std[0], unit * np.exp(LOWEST_SPREAD))
 
 
-def test_a_road_outside_of_the_card_is_refused_unless_asked(tmp_path):
-    episodes, rows = simulate(n_steps=1), simulate(n_steps=1, release="rows")
-    for given, ranges, message in (
-        (episodes, {"n_mainline": [3, 9]}, r"trained on n_mainline in \[3, 9\].* has \[15, 15\]"),
-        (rows, {"span": [1, 2]}, r"trained on span in \[1, 2\], .* has \[1, 3\]"),
-        (episodes, {"flows": [1, 1]}, r"trained on flows in \[1, 1\]"),
+def test_what_a_network_was_not_trained_on_is_named(tmp_path):
+    path, road = tmp_path / "network.safetensors", PAPER_HIGHWAY
+    for ranges, names in (
+        ({"n_mainline": [3, 15], "lanes": [1, 3], "span": [1, 3], "flows": [0, 0]}, []),
+        ({"n_mainline": [3, 9]}, ["n_mainline"]),
+        ({"span": [1, 2], "flows": [1, 1]}, ["span", "flows"]),
+        ({"lanes": [2, 3], "speed_limit": [80.0, 100.0]}, ["speed_limit", "lanes"]),
     ):
-        with pytest.raises(ValueError, match=message):
-            of_network(given, tmp_path, **ranges)
-        of_network(given, tmp_path, outside=True, **ranges)
+        write_network(path, random_network(), {**card(), "ranges": ranges})
+        assert set(outside(read_network(str(path)), road, False, 3)) == set(names)
 
 
 # Files of networks --------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dptse_env.importers import Options, Source, Split, import_trajectories
+from dptse_env.importers.placing import Road
 from dptse_env.traffic import Corridor, Demand
 
 ROAD = Corridor(
@@ -74,3 +75,28 @@ def first_file(imported):
     content = json.loads(path.read_text(encoding="utf-8"))
     assert content == imported.report
     return content["files"][0]
+
+
+def driven(record, corridor, period=0.5):
+    """Return points as `stream`, and the record column of each, of the vehicles of a record.
+
+    They drive from where they enter at the speeds of the record. Positions on ramps are those of
+    the face that they join or leave, minus or plus the distance to it, as the importers have them.
+    """
+    starts = Road(corridor).column_starts[1]
+    points = []
+    for vehicle in np.unique(record.vehicle):
+        own = record.vehicle == vehicle
+        step, column, speed = (each[own] for each in (record.step, record.segment, record.speed))
+        if len(step) < 2:
+            continue
+        way = (speed[1:] + speed[:-1]) / 7.2
+        x = 1000.0 * starts[column[0]] + 2.0 + np.concatenate([[0.0], np.cumsum(way)])
+        times = np.arange(step[0], step[-1] + 0.5 * period, period)
+        at = np.clip(times.astype(int) - step[0], 0, len(step) - 1)
+        points.append(np.column_stack([
+            np.full(len(times), vehicle), times, np.interp(times, step, x),
+            np.interp(times, step, speed) / 3.6, column[at],
+        ]))  # fmt: skip
+    found = np.concatenate(points)
+    return found[:, :4], found[:, 4].astype(int)

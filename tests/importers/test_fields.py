@@ -1,6 +1,7 @@
 """Import of measured fields."""
 
 import dataclasses
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -99,7 +100,7 @@ def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
         ),
         (b"fast slow\n", {}, 100, r"speed\.txt must be a table of numbers"),
         (b"1 2\n3 4\n", {}, 100, r"speed\.txt must be a table of .*density\.txt's shape"),
-        (b"1 2\n-3 4\n", {}, 100, r"speed\.txt: row 2, column 1 must be in \[0, 1e\+06\], got -3"),
+        (b"1 2\n-3 4\n", {}, 100, r"speed\.txt: row 2, column 1 must be in \[0, 1e\+06\], or nan"),
         (None, {}, 100, r"speed\.txt must be a file, got a directory"),
     ],
 )
@@ -172,6 +173,61 @@ def test_a_few_cells_may_be_odd(name, usual, odd, message, tmp_path):
     np.savetxt(tmp_path / f"{name}.txt", table)
     with pytest.raises(ValueError, match=rf"{name}\.txt: {name}_unit must be .*{message}"):
         source.read(4, 110.0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "is_reversed", "warns"),
+    [(30.0, False, False), (30.0, True, True), (90.0, True, False)],
+)
+def test_queues_that_move_downstream_are_told(speed, is_reversed, warns, tmp_path):
+    place, time = 0.05 * np.arange(20)[:, None], 5.0 * np.arange(100)[None]
+    wave = np.sin(2 * np.pi * (time + 3600.0 / 18.0 * place) / 120.0)  # upstream at 18 km/h
+    np.savetxt(tmp_path / "density.txt", 100.0 + 40.0 * wave)
+    np.savetxt(tmp_path / "speed.txt", speed - 10.0 * wave)
+    files = {name: tmp_path / f"{name}.txt" for name in ("density", "speed")}
+    source = FieldSource(**files, cell=0.05, interval=5.0, reversed=is_reversed)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        source.read(4, 110.0)
+    assert any("reversed" in str(each.message) for each in told) == warns
+
+
+def test_short_gaps_are_filled_and_told_and_long_ones_refused(tmp_path):
+    source = write(tmp_path)
+    density, flow = source.read(4, 110.0)
+    table, speeds = np.loadtxt(source.density), np.loadtxt(source.speed)
+    table[2, 10:13] = table[4, 0] = np.nan
+    table[7], speeds[7] = 0.0, np.nan  # nobody was there, so no speed is missing
+    rows = [",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in table]
+    source.density.write_text("\n".join(rows))
+    np.savetxt(source.speed, speeds, delimiter=",")
+    source = dataclasses.replace(source, delimiter=",", longest_gap=15.0)
+    with pytest.warns(UserWarning, match=r"density\.txt: 4 of 900 values are missing") as told:
+        filled, flows = source.read(4, 110.0)
+    assert len(told) == 1
+    expected = density.copy()
+    expected[7], expected[4, 0] = 0.0, density[4, 1]
+    np.testing.assert_allclose(filled, expected)
+    np.testing.assert_allclose(flows[:4], flow[:4])
+    assert (flows[7] == 0.0).all()
+    for changes, message in (
+        (
+            {"longest_gap": 10.0},
+            r"row 3 must have a value every 10 s, got none from column 11 to 13",
+        ),
+        ({"longest_gap": 10.0, "reversed": True}, r"row 3 must .* longest_gap be 15 s or more$"),
+        ({"longest_gap": -1.0}, r"longest_gap must be"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            dataclasses.replace(source, **changes).read(4, 110.0)
+    table[5] = np.nan
+    np.savetxt(source.density, table.T, delimiter=",")
+    np.savetxt(source.speed, speeds.T, delimiter=",")
+    turned = dataclasses.replace(source, transposed=True)
+    with pytest.raises(
+        ValueError, match=r"density\.txt: column 6 must have values, got none: leave"
+    ):
+        turned.read(4, 110.0)
 
 
 def test_a_folder_is_never_replaced(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 
 from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError
 from dptse_env.traffic import RecordLibrary
-from tests.importers.data import PLAIN, ROAD, first_file, plain, run, stream
+from tests.importers.data import PLAIN, ROAD, first_file, plain, run, stream, write_csv
 
 ALL = [Split("training", 1.0, range(100_000))]
 WITH_LANES = dataclasses.replace(PLAIN, columns={**PLAIN.columns, "lane": "lane"})
@@ -220,10 +220,56 @@ def test_rows_off_the_road_are_dropped_and_counted(tmp_path):
 def test_wrong_units_directions_and_numbers_are_refused(factors, offset, message, tmp_path):
     points = stream() * np.array(factors) + np.array([0, 0, offset, 0])
     path = plain(tmp_path / "a.csv", points)
+    units = {"time": "s", "length": "m", "speed": "m/s"}
     with pytest.raises(TrajectoryError, match=message) as refused:
-        run(path)
+        run(path, dataclasses.replace(PLAIN, units=units))
     assert str(refused.value).startswith(str(path))
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+
+
+@pytest.mark.parametrize(
+    ("factors", "recognised"),
+    [
+        ([1, 1, 1, 1], ""),
+        ([1, 1000, 1, 1], "units.time = 'ms'"),
+        ([1, 10, 1, 1], "units.time = 'frame', frame_rate = 10"),
+        ([1, 1, 1, 3.6], "units.speed = 'km/h'"),
+        ([1, 1, 1 / 0.3048, 1 / 0.3048], "units.length = 'ft', units.speed = 'ft/s'"),
+        ([1, 1000, 0.001, 2.23694], "units.time = 'ms', units.length = 'km', units.speed = 'mi/h'"),
+    ],
+)
+def test_units_that_nobody_gave_are_recognised(factors, recognised, tmp_path):
+    points = stream(speed=35.0)
+    expected = record_of(run(plain(subfolder(tmp_path, "plain"), points)), 1)
+    changed = points * np.array(factors)
+    time = [int(each) if each == round(each) else each for each in changed[:, 1].round(6)]
+    changed[:, 2] = changed[:, 2].round(6)
+    path = subfolder(tmp_path, "changed")
+    vehicle, _, x, speed = changed.T
+    write_csv(path, {"t": time, "id": vehicle.astype(int), "s": x, "v": speed})
+    imported = run(path)
+    assert first_file(imported)["recognised"] == recognised
+    text = (tmp_path / "changed" / "imported" / "report.md").read_text()
+    assert (f"Recognised, since nobody gave it: {recognised}." in text) == bool(recognised)
+    record = record_of(imported, 1)
+    np.testing.assert_array_equal(record.counts, expected.counts)
+    np.testing.assert_allclose(record.speed_sums, expected.speed_sums, rtol=1e-4)
+
+
+def test_units_that_may_be_several_are_asked_for(tmp_path):
+    points = stream() * [1, 10, 1, 1]  # frames, and no speeds
+    path = write_csv(
+        tmp_path / "a.csv",
+        {"t": points[:, 1].round().astype(int), "id": points[:, 0], "s": points[:, 2]},
+    )
+    columns = {"time": "t", "vehicle": "id", "x": "s"}
+    message = (
+        r"units must be given, likely units\.time = 'frame', frame_rate = 5 or .*: with time in s"
+    )
+    with pytest.raises(TrajectoryError, match=message):
+        run(path, Source("table", columns))
+    assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+    run(path, Source("table", columns, {"time": "frame"}, frame_rate=10.0))
 
 
 @pytest.mark.slow

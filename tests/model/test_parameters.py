@@ -77,9 +77,12 @@ def test_a_step_too_long_names_the_longest_admissible(time_step):
 
 def test_strong_relaxation_a_large_gamma_and_the_shortest_segment_bound_the_step_too():
     for parameters, road, message in (
-        (replace(PAPER, relaxation_time=0.5), HIGHWAY, r"at most 0.43 s"),
+        (replace(PAPER, relaxation_time=0.5), HIGHWAY, r"must be longer .* at most 0.43 s"),
         (replace(PAPER, gamma=4.0), HIGHWAY, r"at most 0.88 s"),
-        (PAPER, UNEVEN, r"on 0.08 km their CFL condition"),
+        (PAPER, UNEVEN, r"at least (0\.\d+) km .*, got 0\.08 km"),
     ):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=message) as refused:
             ARZModel(road, parameters, 1.6).require_time_step()
+    # The shortest segment that is named is admissible, and none that is shorter.
+    least = float(re.findall(r"at least (0\.\d+) km", str(refused.value))[0])
+    assert PAPER.largest_time_step(least - 1e-4) < 1.6 <= PAPER.largest_time_step(least)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import warnings
 
 import gymnasium as gym
 import polars as pl
@@ -66,6 +67,36 @@ def test_tables_rows_figures_and_json_agree(tmp_path):
     assert (tmp_path / "out" / "page.html").is_file()
 
 
+def test_one_episode_has_no_interval(tmp_path):
+    words = ["--env", WALK, "--seeds", "2000", "--schedules", "none", "--workers", "1"]
+    words += ["--output", tmp_path]
+    found = json.loads(run_command("evaluate", *words, "--json").stdout)
+    (reward,) = rows_of(tmp_path, "none")["reward"]
+    row = next(each for each in found["rows"] if each["policy"] == "none")
+    error = row["means"]["error"]
+    assert error == {"mean": pytest.approx(-1000.0 * reward), "low": None, "high": None, "n": 1}
+    other = rows_of(tmp_path, "paper")["reward"][0]
+    assert row["differences"]["error"]["mean"] == pytest.approx(1000.0 * (other - reward))
+    tables = (tmp_path / "tables.md").read_text()
+    assert "one episode has no interval" in tables.lower()
+    assert "±" not in tables
+    assert "1 episode on test traffic" in tables
+
+
+def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):
+    road = tmp_path / "road.toml"
+    road.write_text("n_mainline = 4\nduration = 62\n[demand]\nmainline = [[0, 1500]]\n")
+    env = f'dptse_env:dptse/PaperHighway-v0 {{"corridor": "{road}", "bandwidth": 2}}'
+    words = ["--env", env, "--seeds", "2000", "--schedules", "none", "--workers", "1"]
+    words += ["--records", tmp_path / "records", "--output", tmp_path / "out"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        done = run_command("evaluate", *words, "--estimators", "ekf", "random_walk")
+    assert done.returncode == 0, done.stderr
+    assert sum("on another road" in each.message for each in caplog.records) == 1
+    assert "Warning" not in done.stderr
+
+
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on_and_a_forced_one_begins_anew(tmp_path):
     args = Args(env=WALK, schedules=("random",), seeds="2000:2002", output=tmp_path, workers=1)
@@ -119,7 +150,7 @@ def test_estimators_and_keywords_reach_the_environment():
         (["--estimators", "kf"], "estimator must be one of"),
         # The first could be played.
         (["--env", SURE, "--estimators", "ekf", "mhe"], "estimator_settings.process_noise[0] must"),
-        (["--seeds", "2000"], "seeds must be"),
+        (["--seeds", "2000:2000"], "seeds must be"),
         (["--policies", "a/b.zip", "c/a/b.zip"], "'a/b'"),
         (["--policies", "nobody.zip"], "nobody.zip"),
         (["--policies", "nobody"], "'nobody'"),

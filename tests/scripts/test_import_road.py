@@ -1,15 +1,19 @@
 """Import of trajectories, of a field and of a network, by the command."""
 
+import dataclasses
+import json
 import re
 import shlex
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from dptse_env.traffic import RecordLibrary, read_corridor
+from dptse_env.traffic import Demand, RecordLibrary, read_corridor
 from tests.helpers import make_env
-from tests.importers.data import STRAIGHT, plain, stream, write_csv
+from tests.importers.data import STRAIGHT, driven, plain, stream, write_csv
 from tests.importers.network.conftest import PATH, motorway
-from tests.importers.test_tables import ngsim
+from tests.importers.test_tables import FOOT, ngsim
 from tests.scripts.commands import ROOT, refused, run_command
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
@@ -92,19 +96,69 @@ def test_what_is_wrong_with_trajectories_is_said(words, message, road, tmp_path)
     assert not (tmp_path / "new").exists()
 
 
-def test_the_page_on_own_data_has_commands_that_run(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def fifteen_minutes(tmp_path_factory):
+    """A folder with the files of the page on data, and 15 minutes of simulated NGSIM rows."""
+    folder = tmp_path_factory.mktemp("page")
     page = (ROOT / "docs" / "own_data.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
     for name, content in re.findall(r"```toml\n# (\S+)\n(.*?)```", page, re.DOTALL):
-        (tmp_path / name).write_text(content)
-    points = stream(seconds=723.0, headway=8.0, length=640.0)
-    for name in ("0750", "0805", "0820"):
-        write_csv(tmp_path / f"{name}.csv", ngsim(points))
-    command = re.search(r"^dptse import (trajectories .*)$", page, re.MULTILINE)[1]
-    printed = run(*shlex.split(command))
-    # The page goes on with these seeds.
-    assert "training: 5 window(s), traffic seeds 0..4" in printed
-    assert "validation: 2 window(s), traffic seeds 1000..1001" in printed
+        (folder / name).write_text(content)
+    flows = Demand(((0.0, 4000.0), (300.0, 6500.0), (600.0, 4500.0)), (400.0,))
+    road = read_corridor(folder / "road.toml")
+    road = dataclasses.replace(road, demand=flows, duration=899)
+    points, column = driven(RecordLibrary(folder / "records").get(road, 0), road)
+    columns = ngsim(points + np.array([0.0, 0.0, 66.0 * FOOT, 0.0]))
+    columns["Vehicle_ID"] %= 25  # some are there twice at one time, as in the portal's file
+    # Six segments, on-ramp, off-ramp, the boundaries up and down the road and those of the ramps.
+    columns["Lane_ID"] = np.array([1, 1, 1, 1, 1, 1, 7, 8, 1, 1, 7, 8])[column]
+    write_csv(folder / "0750am-0805am.csv", columns)
+    return folder
+
+
+def commands_of(name):
+    """Return the command lines of a page."""
+    page = (ROOT / "docs" / name).read_text(encoding="utf-8").replace("\\\n", " ")
+    return [shlex.split(line)[1:] for line in re.findall(r"^dptse .*$", page, re.MULTILINE)]
+
+
+SMALL = {
+    "fit": ["--tries", "1", "--estimators", "ekf", "--rules", "round-robin"],
+    "train": ["--algorithm", 'ppo {"steps": 2000}'],
+}
+"""What makes commands of the page short."""
+
+
+def test_the_page_on_own_data_has_commands_that_run(fifteen_minutes, monkeypatch):
+    monkeypatch.chdir(fifteen_minutes)
+    commands = commands_of("own_data.md")
+    assert [words[0] for words in commands] == [
+        "import", "fit", "evaluate", "train", "evaluate", "import"
+    ]  # fmt: skip
+    printed = run(*commands[0][1:])
+    for part, seed in (("training", 0), ("validation", 1000), ("test", 2000)):
+        assert f"{part}: 1 window(s), traffic seeds {seed}\n" in printed
+    assert "next: dptse fit us-101/road.toml\n" in printed
+    (file,) = json.loads(Path("us-101/report.json").read_text())["files"]
+    assert file["ids_shared"] > 10
+    assert file["vanished"] < 0.02 * file["pieces"]
+    assert re.search(
+        r"^next: dptse evaluate .*us-101/road.toml.* --seeds 2000:2001$", printed, re.M
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+def test_the_page_on_own_data_goes_on_to_a_policy(fifteen_minutes, monkeypatch):
+    monkeypatch.chdir(fifteen_minutes)
+    first, *rest = commands_of("own_data.md")[:-1]
+    printed = run(*first[1:], "--output", "again")
+    following = re.search(r"^next: dptse (evaluate .*)$", printed, re.MULTILINE)[1]
+    if not Path("us-101").exists():
+        run(*first[1:])
+    for words in (*rest, shlex.split(following)):
+        done = run_command(*words, *SMALL.get(words[0], []))
+        assert done.returncode == 0, done.stderr
+    assert "1 episode on test traffic" in done.stdout
 
 
 @pytest.fixture(scope="module")

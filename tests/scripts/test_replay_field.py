@@ -19,13 +19,28 @@ def test_a_row_for_each_estimator(tmp_path):
     assert "EKF" in done.stdout
     assert "recurrent" in done.stdout
 
-    def error(keywords):
-        env = f"dptse_env:dptse/PaperHighway-v0 {json.dumps(keywords)}"
-        printed = run_command(*words, "--estimators", "ekf", "--env", env, "--json").stdout
-        return json.loads(printed)["ekf"]["error"]
+    def scores(*more):
+        return json.loads(run_command(*words, "--estimators", "ekf", *more, "--json").stdout)
 
-    given = {"privacy": "corrected", "bandwidth": 2}
-    assert error({**given, "epsilon": 50.0}) < error(given) != error({**given, "bandwidth": 1})
-    env = "dptse_env:dptse/PaperHighway-v0"
-    assert "bandwidth must be" in refused(*words, "--env", f'{env} {{"privacy": "corrected"}}')
-    assert "privacy must be" in refused(*words, "--env", env)
+    usual = scores()
+    assert set(usual["ekf"]) == {"error", "density", "speed", "chi2_density", "chi2_speed"}
+    assert scores("--settings", "ekf-w99-3lane-corrected") == usual
+    assert scores("--parameters", "paper")["ekf"]["error"] != usual["ekf"]["error"]
+    assert scores("--epsilon", "50")["ekf"]["error"] < usual["ekf"]["error"]
+    assert scores("--bandwidth", "1") != usual
+    assert scores("--preset", "paper")["ekf"]["error"] < usual["ekf"]["error"]
+    wide = scores("--settings", '{"noise_scale": [3.0, 3.0]}')
+    assert wide["ekf"]["chi2_density"] != usual["ekf"]["chi2_density"]
+
+
+def test_what_does_not_suit_a_field_is_refused(tmp_path):
+    field = source(tmp_path, columns=60)
+    words = [
+        "replay-field", "--density", field.density, "--speed", field.speed, "--cell", "0.05",
+        "--interval", "5", "--density-unit", "veh/ft", "--speed-unit", "ft/s", "--segments", "3",
+    ]  # fmt: skip
+    words += ["--speed-limit", "50", "--window", "100"]
+    assert "privacy.preset must be" in refused(*words, "--preset", "paced")
+    assert "settings must be" in refused(*words, "--settings", "{1")
+    assert "bandwidth must be" in refused(*words, "--bandwidth", "5")
+    assert "parameters must be" in refused(*words, "--parameters", "mine")

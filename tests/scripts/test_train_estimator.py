@@ -1,4 +1,5 @@
 import json
+from itertools import product
 
 import pytest
 
@@ -10,15 +11,22 @@ import tyro
 
 from agents.filters.plan import OWN, Round
 from agents.training.run_files import read_progress
+from dptse_env.estimators.recurrent import read_network
 from scripts import train_estimator
 from scripts.train_estimator import Args, make_plan, parse_round
 from tests.helpers import SHORT
 
-RANGES = {"mechanisms": ["capped", "paced"], "schedules": ["round-robin"]}
-PLAN = {"width": 4, "checkpoint_every": 2, "ranges": RANGES}
+PLAN = {
+    "width": 4,
+    "checkpoint_every": 2,
+    "seconds": 100,
+    "validation_highways": [1000, 1000],
+    "ranges": {"sections": 0.0, "highways": [0, 1], "schedules": ["round-robin"]},
+}
 SMALL = [
     "--env", SHORT, "--traffic", "0:2", "--validation-env", SHORT, "--validation", "1000:1001",
-    "--rounds", "ekf:1:2", "own:1:1", "--plan", json.dumps(PLAN),
+    "--rounds", "ekf:1:2", "own:1:1", "--seeds", "0:2", "--workers", "1", "--plan",
+    json.dumps(PLAN),
 ]  # fmt: skip
 
 
@@ -26,15 +34,20 @@ def arguments(output, *more):
     return tyro.cli(Args, args=["--output", str(output), *SMALL, *more])
 
 
-def test_it_trains_a_network_that_an_environment_takes(tmp_path, capsys):
+def test_it_trains_a_pair_that_an_environment_takes(tmp_path, capsys):
     train_estimator.main(arguments(tmp_path))
     keywords = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert [row["round"] for row in read_progress(tmp_path)] == [1, 1, 2]
-    gym.make(SHORT, privacy="capped", **keywords).reset(seed=0)
-    with pytest.raises(ValueError, match=r"trained on flows in \[1, 1\], .* has \[0, 0\]"):
-        gym.make(SHORT, **keywords).reset(seed=0)
-    with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
-        train_estimator.main(arguments(tmp_path, "--seed", "1"))
+    best = {}
+    for kind, seed in product(("flows", "speeds"), (0, 1)):
+        rows = read_progress(tmp_path / f"{kind}-{seed}")
+        assert [row["round"] for row in rows] == [1, 1, 2]
+        best.setdefault(kind, []).append((rows[-1]["validation"], seed))
+    for kind, privacy in (("flows", "capped"), ("speeds", "paper")):
+        taken = read_network(str(tmp_path / f"network-{kind}.safetensors")).card["name"]
+        assert taken == f"{kind}-{min(best[kind])[1]}"
+        gym.make(SHORT, privacy=privacy, **keywords).reset(seed=0)
+    with pytest.raises(ValueError, match="width is 4 there and 8 now"):
+        train_estimator.main(arguments(tmp_path, "--plan", json.dumps({**PLAN, "width": 8})))
 
 
 def test_rounds_are_read_from_text():
@@ -52,9 +65,9 @@ def test_rounds_are_read_from_text():
         (["--plan", "[3]"], "plan must be a mapping"),
         (["--plan", "{"], "plan must be JSON: "),
         (["--plan", '{"wide": 3}'], r"plan\.wide is unknown"),
-        (["--plan", '{"ranges": {"largest_share": 0}}'], r"ranges\.largest_share must be in"),
+        (["--plan", '{"ranges": {"sections": 2}}'], r"ranges\.sections must be a number in"),
     ],
 )
 def test_bad_arguments_are_named(more, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        make_plan(arguments(tmp_path, *more))
+        make_plan(arguments(tmp_path, *more), "flows", 0)

@@ -143,7 +143,7 @@ def road_cells(
     """Return the cells of an estimator on a road, a network with its weights and its name."""
     more: dict[str, Any] = {"estimator": estimator}
     if weights:
-        more["estimator_settings"] = {"recurrent": {"weights": weights, "outside": True}}
+        more["estimator_settings"] = {"recurrent": {"weights": weights}}
     labels = on_road(road, release, estimator, network)
     return [
         Cell(
