@@ -241,6 +241,7 @@ LABELS = {
     "mhe": "MHE",
     "random_walk": "random walk",
     "blend": "EKF and random walk",
+    "asm": "adaptive smoothing",
     "recurrent": "recurrent",
     "open_loop": "open loop",
 }

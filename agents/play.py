@@ -15,6 +15,7 @@ from filelock import FileLock
 from agents.environments import make_config, make_vector, quietly
 from agents.policies import NamedSchedule, find_policy
 from agents.watchers import WATCHERS
+from dptse_env.estimators.recurrent import member_for
 from dptse_env.evaluation import Row, evaluate
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.traffic import Corridor, RecordLibrary, Records, open_library
@@ -110,13 +111,15 @@ class Cell:
 
 
 def _with_digests(value: Any) -> Any:
-    """Return plain JSON with the digest of a file in place of its name."""
+    """Return plain JSON with digests in place of a file's name, or that of a pair of networks."""
     if isinstance(value, Mapping):
         return {key: _with_digests(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [_with_digests(each) for each in value]
-    if isinstance(value, str) and Path(value).is_file():
-        return f"sha256:{file_digest(value)}"
+    if isinstance(value, str):
+        members = dict.fromkeys(member_for(value, flows) for flows in (True, False))
+        files = [member for member in members if Path(member).is_file()]
+        return "+".join(f"sha256:{file_digest(file)}" for file in files) or value
     return value
 
 

@@ -107,7 +107,7 @@ def measure(*, quick: bool = False) -> list[Line]:
         if base:
             bases[what] = base
 
-    for name in (*REFERENCES, "recurrent"):
+    for name in (*REFERENCES, "recurrent", "asm"):
         label = LABELS[name]
         add(label, "", name, "compiled", alone)
         add(f"{label}, batch of {n_batch}", label, name, "compiled", batch)

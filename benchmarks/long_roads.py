@@ -21,7 +21,7 @@ from dptse_env.vector_env import SensorQueryVectorEnv
 
 DURATION = 1200  # [s], in which a vehicle passes 200 segments and a jam ends
 EVERY = 15  # segments from one on-ramp to the next, and from one off-ramp to the next
-ESTIMATORS = ("ekf", "ukf", "enkf", "mhe", "recurrent")
+ESTIMATORS = ("ekf", "ukf", "enkf", "mhe", "recurrent", "asm")
 
 
 def long_road(n_mainline: int) -> Corridor:

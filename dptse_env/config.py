@@ -86,8 +86,8 @@ class EnvConfig:
     Attributes:
         corridor: The road, its demand, incident and fixed sensors.
         estimator: The estimator: ``ekf``, ``ukf``, ``enkf``, ``mhe``, ``random_walk``,
-            ``blend``, ``open_loop``, ``recurrent``, a registered name, ``"package.module:Class"``,
-            or a class.
+            ``blend``, ``open_loop``, ``recurrent``, ``asm``, a registered name,
+            ``"package.module:Class"``, or a class.
         backend: ``compiled``, or ``reference``, which EKF, UKF, EnKF and MHE have.
         parameters: ARZ parameters, or the name of a set.
         estimator_settings: Tuning of the estimator, or the name of a shipped set

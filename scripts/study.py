@@ -27,7 +27,7 @@ from dptse_env.utils.fields import require
 from scripts.cli import Machines
 from scripts.suite import suitable
 
-STUDIES = ("paper", "guarantees", "estimators", "policies", "suite")
+STUDIES = ("paper", "guarantees", "estimators", "roads", "policies", "suite")
 RESULTS = Path("results")
 QUICK_SEEDS = 3
 
@@ -37,7 +37,7 @@ class Args(Machines):
     """Play a study and write its report."""
 
     name: tyro.conf.Positional[str]
-    """paper, guarantees, estimators, policies, suite, or your own "module:NAME"."""
+    """paper, guarantees, estimators, roads, policies, suite, or your own "module:NAME"."""
     report: bool = False
     """Write tables and figures of the rows that are there, and play nothing."""
     quick: bool = False
@@ -49,6 +49,9 @@ class Args(Machines):
     with these keywords; needs another output."""
     policies: tuple[str, ...] = ()
     """Trained policies for the study of policies, each name=path."""
+    weights: tuple[str, ...] = ()
+    """Networks for the study of roads, in place of the shipped one, or of estimators, beside it:
+    names, or paths without "-flows.safetensors" and "-speeds.safetensors"; need another output."""
     output: Path | None = None
     """Folder of the results; results/NAME if not given, with "-quick" for quick ones."""
 
@@ -59,12 +62,17 @@ def find_study(args: Args) -> Study:
     Raises:
         ValueError: There is no such study, or an argument is of another one.
     """
-    if args.policies and args.name != "policies":
-        raise ValueError(f"policies are arguments of the study policies, not of {args.name!r}")
+    for argument, names in (("policies", ("policies",)), ("weights", ("estimators", "roads"))):
+        if getattr(args, argument) and args.name not in names:
+            raise ValueError(
+                f"{argument} are arguments of the study {' or '.join(names)}, not of {args.name!r}"
+            )
     if args.policies:
         from agents.studies.policies import study as with_policies  # noqa: PLC0415
 
         found = with_policies(args.policies)
+    elif args.weights:
+        found = importlib.import_module(f"agents.studies.{args.name}").study(args.weights)
     elif args.name in STUDIES:
         found = importlib.import_module(f"agents.studies.{args.name}").STUDY
     elif ":" in args.name:
@@ -124,7 +132,7 @@ def main(args: Args) -> None:
     """Play what is missing, and report."""
     study = find_study(args)
     folder = args.output or RESULTS / f"{study.name}{'-quick' if args.quick else ''}"
-    for name in ("seeds", "env"):
+    for name in ("seeds", "env", "weights"):
         require(
             not getattr(args, name) or args.output is not None,
             name,

@@ -52,6 +52,13 @@ SPACE: dict[str, dict[str, Knob]] = {
         "blend.density_weight": FloatDistribution(0.0, 1.0),
         "blend.speed_weight": FloatDistribution(0.0, 1.0),
     },
+    "asm": {
+        "asm.time": evenly(2.0, 60.0),
+        "asm.length": evenly(0.02, 0.5),
+        "asm.jam_wave": FloatDistribution(12.0, 25.0),
+        "asm.threshold": FloatDistribution(30.0, 90.0),
+        "asm.boundary_weight": evenly(0.05, 5.0),
+    },
 }
 """By estimator."""
 
@@ -103,8 +110,10 @@ def search_space(estimator: str, extras: Collection[Extra] = ()) -> dict[str, Kn
     require_name("estimators", estimator, SPACE)
     for name in extras:
         require_name("also", name, get_args(Extra))
-    if "demand" in extras and estimator == "random_walk":
-        raise ValueError("also must leave out demand for 'random_walk', which has no traffic model")
+    if "demand" in extras and estimator in ("random_walk", "asm"):
+        raise ValueError(
+            f"also must leave out demand for {estimator!r}, which has no traffic model"
+        )
     space = dict(SPACE[estimator])
     for name, knobs in EXTRAS.items():
         space |= knobs if name in extras else {}

@@ -8,6 +8,7 @@ queries, beside three detectors on the mainline that count every vehicle.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import product
@@ -79,43 +80,19 @@ WORLDS: dict[str, World] = {
 }
 MAIN = tuple(WORLDS)[:4]
 """Worlds in which estimators meet query policies."""
-_LONG_ROAD = {
-    "n_mainline": 60,
-    "on_ramps": [9, 29, 49],
-    "off_ramps": [19, 39, 54],
-    "exit_shares": [0.1, 0.1, 0.1],
-    "fixed_sensors": [59, 63, 64, 65],
-    "average_dwell": 10.25,
-    "demand": {
-        "base": {
-            "mainline": [[0.0, 2500.0], [150.0, 5400.0], [500.0, 2500.0]],
-            "on_ramps": [300.0, 300.0, 300.0],
-        }
-    },
-    "incident": {"segments": list(range(59))},
-}
 _INCIDENT = {"segment": 10, "phases": [[200.0, 400.0, 10.08], [400.0, 500.0, 50.95]]}
-_DRIVERS = {
-    "drivers by Krauss": {"model": "Krauss"},
-    "drivers by IDM": {"model": "IDM"},
-    "headways of 0.6 s, mixed speeds": {"headway": 0.6, "speed_deviation": 0.2},
-    "headways of 2 s": {"headway": 2.0},
-}
 ELSEWHERE: dict[str, World] = {
-    **{name: (PRIVATE, {"corridor": {"drivers": drivers}}) for name, drivers in _DRIVERS.items()},
     "no incident": (PRIVATE, {"incident": "none"}),
     "the paper's incident": (PRIVATE, {"incident": _INCIDENT}),
     "demand with two peaks": (PRIVATE, {"demand": OTHER_DRIVERS["demand"]}),
-    "a road of 6 km, B = 20": (PRIVATE, {"corridor": _LONG_ROAD, "bandwidth": 20}),
     "ShortHighway-v0": (SHORT, {}),
     **{f"ε = {epsilon:g}": (PRIVATE, {"epsilon": epsilon}) for epsilon in (0.5, 2.0, 10.0, 20.0)},
     **{f"B = {bandwidth}": (PRIVATE, {"bandwidth": bandwidth}) for bandwidth in (1, 2, 10, 15)},
 }
-"""Worlds that differ from PrivateHighway-v1 in one thing, and a road of its own."""
+"""Worlds that differ from PrivateHighway-v1 in one thing, and ShortHighway-v0; other roads and
+drivers are in the study of roads."""
 MOVED = (EKF, WALK, LEARNED)
 MOVED_SEEDS = SEEDS[:24]
-N_NETWORKS = 5
-"""Training seeds of networks with recorded rows; the first comes with the package."""
 
 
 def in_world(
@@ -126,15 +103,24 @@ def in_world(
     return {"part": "estimators", **labels}
 
 
-def world_cell(world: str, estimator: str, policy: str = ROUND_ROBIN) -> Cell:
-    """Return the cell of an estimator in a world, with the network that the package has."""
+def world_cell(
+    world: str,
+    estimator: str,
+    policy: str = ROUND_ROBIN,
+    *,
+    network: int = 0,
+    weights: str = "highway",
+) -> Cell:
+    """Return the cell of an estimator in a world; network 0 is the one of the package."""
     env, changes = {**WORLDS, **ELSEWHERE}[world]
     keywords = {**changes, "estimator": estimator}
+    if estimator == LEARNED:
+        keywords["estimator_settings"] = {"recurrent": {"weights": weights}}
     return Cell(
         env,
         policy,
         keywords,
-        in_world(world, estimator, policy),
+        in_world(world, estimator, policy, network),
         transferred=policy == SHIPPED,
         watchers=("honesty",),
         seeds=MOVED_SEEDS if world in ELSEWHERE else None,
@@ -338,7 +324,8 @@ def world_tables(rows: pl.DataFrame) -> list[str]:
     moved = {world: in_world(world) for world in ELSEWHERE}
     parts += ["## Away from the training", MOVED_NOTES, "![Gains](fig_elsewhere.png)"]
     parts.append(table("PrivateHighway-v1 but for", moved, columns))
-    columns = {str(k): partial(network, network=k) for k in range(N_NETWORKS)}
+    played = rows.filter(part="estimators", estimator=LEARNED)["network"].unique().sort()
+    columns = {str(k): partial(network, network=k) for k in played}
     worlds = {world: in_world(world) for world in WORLDS}
     parts += ["## Training seeds of the network", "Error x 1000 (χ²). Only 0 is in the package."]
     return [*parts, table("", worlds, columns)]
@@ -486,3 +473,12 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
 
 
 STUDY = Study("estimators", (*WORLD_CELLS, *SENSED_CELLS), SEEDS, report)
+
+
+def study(weights: Sequence[str]) -> Study:
+    """Return the study with networks of other training seeds, numbered from 1 on."""
+    more = [
+        world_cell(world, LEARNED, network=number, weights=each)
+        for world, (number, each) in product(WORLDS, enumerate(weights, start=1))
+    ]
+    return dataclasses.replace(STUDY, cells=(*STUDY.cells, *more))

@@ -7,6 +7,7 @@ import numpy as np
 
 from dptse_env.estimators.base import Backend, BatchEstimator, Estimate, Estimator, Measurement
 from dptse_env.estimators.settings import (
+    AdaptiveSmoothingSettings,
     BlendSettings,
     DemandSettings,
     EnsembleSettings,
@@ -24,6 +25,7 @@ __all__ = [
     "BACKENDS",
     "ESTIMATORS",
     "REFERENCES",
+    "AdaptiveSmoothingSettings",
     "BatchEstimator",
     "BlendSettings",
     "DemandSettings",
@@ -61,6 +63,7 @@ ESTIMATORS = Registry(
         "blend": "dptse_env.estimators.simple:Blend",
         "open_loop": "dptse_env.estimators.simple:OpenLoop",
         "recurrent": "dptse_env.estimators.recurrent:Recurrent",
+        "asm": "dptse_env.estimators.asm:AdaptiveSmoothing",
     },
     check=_expected,
 )
@@ -138,8 +141,8 @@ def make_estimator(
 
     Args:
         estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `blend` (a mean
-            of EKF and random walk), `open_loop` (no measurements), `recurrent` (a network), a
-            registered name, ``"package.module:Class"`` or a class.
+            of EKF and random walk), `open_loop` (no measurements), `recurrent` (a network), `asm`
+            (adaptive smoothing), a registered name, ``"package.module:Class"`` or a class.
         backend: `compiled` (numba), or `reference` (filterpy, qpsolvers, numpy), which EKF, UKF,
             EnKF and MHE have.
         model: The traffic model.

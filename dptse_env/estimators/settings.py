@@ -175,6 +175,30 @@ class BlendSettings(_Checked, path=f"{_PATH}.blend"):
 
 
 @dataclass(frozen=True)
+class AdaptiveSmoothingSettings(_Checked, path=f"{_PATH}.asm"):
+    """Constants of adaptive smoothing (Treiber and Helbing, 2002), the same for all quantities.
+
+    Attributes:
+        time: tau [s], the time in which the weight of a value falls to 1 / e.
+        length: s [km], the distance in which it falls to 1 / e.
+        free_wave: Speed at which traffic that flows freely carries changes downstream [km/h].
+        jam_wave: Speed at which congested traffic carries changes upstream [km/h].
+        threshold: V [km/h], the speed at which traffic counts as half congested.
+        transition: dV [km/h], the width of the transition between both.
+        boundary_weight: Weight of a second of the model's inputs at an end of the road, beside
+            that of a released value.
+    """
+
+    time: Annotated[float, Interval(0.1, 300)] = 10.0
+    length: Annotated[float, Interval(1e-3, 1)] = 0.1
+    free_wave: Annotated[float, Interval(20, 300)] = 120.0
+    jam_wave: Annotated[float, Interval(8, 60)] = 18.0
+    threshold: Annotated[float, Interval(0, 300)] = 60.0
+    transition: Annotated[float, Interval(1, 100)] = 20.0
+    boundary_weight: Annotated[float, Interval(0, 1000)] = 1.0
+
+
+@dataclass(frozen=True)
 class EstimatorSettings(_Checked, path=_PATH):
     """Tuning of the estimators, in units of the jam density rho_m and of v_f.
 
@@ -203,6 +227,7 @@ class EstimatorSettings(_Checked, path=_PATH):
         blend: Further settings of the blend, whose EKF and random walk share the others.
         recurrent: Settings of the recurrent network; of the others it has `initial_variance`,
             `noise_scale` and `speed_cap`.
+        asm: Settings of adaptive smoothing, which has the same ones of the others.
     """
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
@@ -219,6 +244,7 @@ class EstimatorSettings(_Checked, path=_PATH):
     mhe: HorizonSettings = field(default_factory=HorizonSettings)
     blend: BlendSettings = field(default_factory=BlendSettings)
     recurrent: RecurrentSettings = field(default_factory=RecurrentSettings)
+    asm: AdaptiveSmoothingSettings = field(default_factory=AdaptiveSmoothingSettings)
 
 
 def tuned_settings(

@@ -12,7 +12,7 @@ import pytest
 from agents.study import read_rows, write_report
 
 RESULTS = Path(__file__).parents[3] / "results"
-NAMES = ["estimators", "guarantees", "paper", "policies", "suite"]
+NAMES = ["estimators", "guarantees", "paper", "policies", "roads", "suite"]
 
 pytestmark = pytest.mark.skipif(not RESULTS.is_dir(), reason="a source archive has no results")
 

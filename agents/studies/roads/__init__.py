@@ -1,0 +1,288 @@
+"""Estimators on roads that nobody trained on: own roads, sections of longer ones, other simulators.
+
+Every vehicle answers queries, which go round robin. The filters have the parameters and settings
+that were calibrated for PrivateHighway-v1. Networks other than the one of the package are given by
+``--weights``; rows of the filters are played once.
+
+dptse study roads --weights results/networks/seed-2/roads --output results/mine
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import polars as pl
+from matplotlib.figure import Figure
+
+from agents.figures import LABELS, draw_errors, save_measured
+from agents.play import Cell
+from agents.statistics import Interval
+from agents.studies.roads.own import KEPT_BACK, OWN_ROADS
+from agents.studies.roads.recorded import IDM_SEEDS, QUEUES
+from agents.study import Study
+from agents.tables import (
+    DENSITY,
+    ERROR,
+    Labels,
+    UnmeasuredError,
+    below,
+    cell,
+    give_or_take,
+    grid,
+    mean,
+    tenths,
+)
+from dptse_env.estimators.recurrent import member_for, shipped_networks
+from dptse_env.utils.files import file_digest
+
+OPENED = False
+"""Whether the roads that were kept back are played."""
+
+PRIVATE, PAPER = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/PaperHighway-v0"
+LONG = "dptse_env:dptse/LongHighway-v0"
+SEEDS, MORE_SEEDS = tuple(range(2000, 2008)), tuple(range(2000, 2016))
+FILTERS, NETWORK = ("ekf", "blend"), "recurrent"
+SHIPPED = "highway"
+"""The network of the package."""
+PACED, CORRECTED = "paced", "corrected"
+RELEASES: dict[str, dict[str, Any]] = {
+    PACED: {"privacy": PACED, "epsilon": 5.0},
+    CORRECTED: {"privacy": CORRECTED, "epsilon": 1.0},
+    "paper": {"privacy": "paper", "epsilon": 1.0},
+}
+"""Keywords of the release models, which are those of the environments that come with them."""
+
+
+_Part = tuple[dict[str, Any], tuple[int, ...]]
+
+
+class Road(NamedTuple):
+    """A road with its traffic.
+
+    Attributes:
+        env: Environment id.
+        parts: Keywords, each with traffic seeds that no other one has.
+        releases: Release models.
+    """
+
+    env: str
+    parts: Sequence[_Part]
+    releases: Sequence[str] = (PACED, CORRECTED)
+
+
+def _recorded(road: str, seeds: tuple[int, ...], bandwidth: int) -> _Part:
+    """Return a part of the road that `agents.studies.roads.recorded` has by a name."""
+    corridor = f"agents.studies.roads.recorded:{road}"
+    return {"corridor": corridor, "bandwidth": bandwidth, "traffic_seeds": seeds}, seeds
+
+
+_CALIBRATED = {"parameters": "w99-3lane"}
+OTHERS: dict[str, Road] = {
+    **{
+        f"sections, {queue}": Road(
+            PRIVATE, [_recorded(f"section_{each}", (each,), bandwidth=3) for each in numbers]
+        )
+        for queue, numbers in QUEUES.items()
+    },
+    "another simulator": Road(PRIVATE, [_recorded("idm", IDM_SEEDS, bandwidth=2)]),
+    "PrivateHighway-v1": Road(PRIVATE, [({}, MORE_SEEDS)]),
+    "PaperHighway-v0": Road(PAPER, [(_CALIBRATED, MORE_SEEDS)], ("paper", CORRECTED)),
+    "LongHighway-v0": Road(LONG, [({}, SEEDS)], (PACED,)),
+}
+"""Beside the own roads: recorded ones, and those that networks are trained on."""
+OWN = {name: Road(PRIVATE, [(keywords, SEEDS)]) for name, keywords in OWN_ROADS.items()}
+ROADS = {**OWN, **OTHERS}
+
+
+def lines() -> list[tuple[str, str]]:
+    """Return each road with each of its release models."""
+    shown = (name for name in ROADS if OPENED or name not in KEPT_BACK)
+    return [(name, release) for name in shown for release in ROADS[name].releases]
+
+
+def on_road(road: str, release: str, estimator: str, network: str = "") -> Labels:
+    """Return the labels of an estimator on a road."""
+    return {"road": road, "release": release, "estimator": estimator, "network": network}
+
+
+def member(weights: str, release: str) -> str | None:
+    """Return the network of a pair that suits a release model; None where it is missing."""
+    found = member_for(weights, flows=release == PACED)
+    return found if found in shipped_networks() or Path(found).is_file() else None
+
+
+def named(weights: str) -> str:
+    """Return the name of a network in tables: its own, and for files that with a digest of them.
+
+    Raises:
+        FileNotFoundError: There is no such network.
+    """
+    members = sorted({found for each in RELEASES if (found := member(weights, each))})
+    if not members:
+        raise FileNotFoundError(
+            f"weights must be a network of the package, a file, or what the files "
+            f"<weights>-flows.safetensors and <weights>-speeds.safetensors begin with, "
+            f"got {weights!r}"
+        )
+    if members[0] in shipped_networks():
+        return weights
+    digest = hashlib.sha256("".join(map(file_digest, members)).encode()).hexdigest()
+    return f"{Path(weights).name} {digest[:6]}"
+
+
+def road_cells(
+    road: str, release: str, estimator: str, weights: str = "", network: str = ""
+) -> list[Cell]:
+    """Return the cells of an estimator on a road, a network with its weights and its name."""
+    more: dict[str, Any] = {"estimator": estimator}
+    if weights:
+        more["estimator_settings"] = {"recurrent": {"weights": weights}}
+    labels = on_road(road, release, estimator, network)
+    return [
+        Cell(
+            ROADS[road].env, "round-robin", {**keywords, **RELEASES[release], **more}, labels,
+            watchers=("honesty",), seeds=seeds,
+        )
+        for keywords, seeds in ROADS[road].parts
+    ]  # fmt: skip
+
+
+def study(weights: Sequence[str] = (SHIPPED,)) -> Study:
+    """Return the study with some networks, each a name or what the files of a pair begin with.
+
+    One of a pair is played where it suits.
+
+    Raises:
+        FileNotFoundError: There is no such network.
+    """
+    who = [*((name, "", "") for name in FILTERS), *((NETWORK, w, named(w)) for w in weights)]
+    cells = [
+        each
+        for (road, release), (estimator, own, name) in product(lines(), who)
+        if not own or member(own, release)
+        for each in road_cells(road, release, estimator, own, name)
+    ]
+    return Study("roads", tuple(cells), SEEDS, report)
+
+
+# ---- Tables and a figure. ----
+
+NOTES = f"""Errors are minus the reward after the warm-up, x 1000, on {len(SEEDS)} test seeds or
+more, with 95 % intervals. *Best filter*: the one with the smallest mean error; differences from it
+are paired. *χ²*: mean square of errors over reported deviations, of densities and of speeds.
+Nothing was chosen on roads with an asterisk: they were played once, at the end."""
+
+
+def best_filter(rows: pl.DataFrame, road: str, release: str) -> str:
+    """Return the filter with the smallest mean error on a road.
+
+    Raises:
+        UnmeasuredError: One of them was not played there.
+    """
+    return min(FILTERS, key=lambda name: mean(rows, on_road(road, release, name), ERROR).mean)
+
+
+def gain(rows: pl.DataFrame, network: str, road: str, release: str) -> Interval:
+    """Return by how much a network's error lies below that of the best filter [%], paired.
+
+    Raises:
+        UnmeasuredError: Something was not played there.
+    """
+    best = on_road(road, release, best_filter(rows, road, release))
+    return below(rows, on_road(road, release, NETWORK, network), best)
+
+
+def networks_of(rows: pl.DataFrame) -> list[str]:
+    """Return the names of the networks that were played, that of the package first."""
+    names = rows.filter(estimator=NETWORK)["network"].unique().to_list()
+    return sorted(names, key=lambda name: (name != SHIPPED, name))
+
+
+def chi2(rows: pl.DataFrame, labels: Labels) -> list[float]:
+    """Return the mean squares of errors over deviations, of densities and of speeds."""
+    return [mean(rows, labels, f"chi2_{kind}").mean for kind in ("density", "speed")]
+
+
+def network_table(rows: pl.DataFrame, network: str) -> str:
+    """Return the table of a network beside the filters."""
+
+    def of(estimator: str, line: tuple[str, str]) -> Labels:
+        return on_road(*line, estimator, network if estimator == NETWORK else "")
+
+    def error(estimator: str, line: tuple[str, str]) -> str:
+        return give_or_take(mean(rows, of(estimator, line), ERROR))
+
+    def honesty(estimator: str, line: tuple[str, str]) -> str:
+        return ", ".join(f"{each:.2f}" for each in chi2(rows, of(estimator, line)))
+
+    def density_ratio(line: tuple[str, str]) -> str:
+        own, ekf = (mean(rows, of(each, line), DENSITY).mean for each in (NETWORK, "ekf"))
+        return f"{own / ekf:.2f}"
+
+    columns: dict[str, Callable[[tuple[str, str]], str]] = {
+        **{LABELS[name]: partial(error, name) for name in (*FILTERS, NETWORK)},
+        "below best filter [%]": lambda line: tenths(gain(rows, network, *line)),
+        **{f"χ² of {LABELS[name]}": partial(honesty, name) for name in (FILTERS[-1], NETWORK)},
+        "density RMSE over EKF's": density_ratio,
+    }
+    heads = {f"{line[0]}{'*' * (line[0] in KEPT_BACK)}, {line[1]}": line for line in lines()}
+    return grid("", list(heads), list(columns), lambda name, head: columns[head](heads[name]))
+
+
+def summary(rows: pl.DataFrame, network: str) -> str:
+    """Return a sentence for each release model on the own roads together.
+
+    Raises:
+        UnmeasuredError: None was played.
+    """
+    said = []
+    for release in (PACED, CORRECTED):
+        gains, worst = {}, {}
+        for road in OWN:
+            with contextlib.suppress(UnmeasuredError):
+                gains[road] = gain(rows, network, road, release).mean
+                worst[road] = max(chi2(rows, on_road(road, release, NETWORK, network)))
+        if not gains:
+            raise UnmeasuredError(network)
+        least, largest = min(gains, key=gains.__getitem__), max(worst, key=worst.__getitem__)
+        said.append(
+            f"`{release}`: {np.mean([*gains.values()]):.1f} % below the best filter in the mean "
+            f"over {len(gains)} own roads, at least {gains[least]:.1f} % ({least}); χ² at most "
+            f"{worst[largest]:.2f} ({largest})."
+        )
+    return "\n".join(f"- {each}" for each in said)
+
+
+def draw_gains(rows: pl.DataFrame) -> Figure:
+    """Draw by how much the network of the package errs less than the best filter of each road."""
+    label = "error below that of the best filter [%]"
+    names = list(dict.fromkeys(road for road, _ in lines()))
+    series = {
+        release: {
+            road: {label: gain(rows, SHIPPED, road, release)}
+            for road in names
+            if release in ROADS[road].releases
+        }
+        for release in RELEASES
+    }
+    return draw_errors(names, series, log=False)
+
+
+def report(rows: pl.DataFrame, folder: Path) -> str:
+    """Return a table for each network, and draw the gains of that of the package."""
+    title = "Error of the recurrent network below that of the best filter, 95 % intervals"
+    save_measured(folder / "fig_roads.png", title, draw_gains, rows)
+    parts = ["# Roads that nobody trained on", NOTES, "![Gains](fig_roads.png)"]
+    for network in networks_of(rows):
+        parts += [f"## `{network}`", cell(summary, rows, network), network_table(rows, network)]
+    return "\n\n".join(parts)
+
+
+STUDY = study()

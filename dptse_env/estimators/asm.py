@@ -1,0 +1,565 @@
+"""Adaptive smoothing (Treiber and Helbing, 2002), causal: a kernel mean of what was released.
+
+For a place x and the present second t, over released values z_j of places x_j and seconds t_j up to
+t, two means are taken, one along the waves of free traffic and one along those of congested
+traffic, c = c_free > 0 and c = -c_jam < 0:
+
+    z_c(x) = sum_j phi_c z_j / sum_j phi_c
+    phi_c = exp(-|x_j - x| / s - |t_j - t - (x_j - x) / c| / tau)
+
+They are the same for densities and speeds, and are mixed by how congested the slower of both finds
+traffic, m = (1 + tanh((V - v) / dV)) / 2 with v = min(v_free, v_jam):
+
+    z(x) = m z_jam(x) + (1 - m) z_free(x)
+
+Densities are smoothed per lane, along the mainline and along each ramp for itself: smoothed into
+each other, errors of the mainline are up to a half larger. A released flow becomes a speed,
+centre + flow / density, by the density estimated before it; where that is below `LEAST_DENSITY`,
+vehicles at the speed limit are added up to it. Neighbours further away than `REACH` s are left out.
+What the model's inputs say of the ends of the road are values as well, half a segment beyond it:
+behind an exit drivers keep their w = v + p(rho). The prior is a value of second 0.
+
+Sums over all seconds take no history of releases. With the decay r = exp(-1 / tau) of a step and
+P_t = r P_{t-1} + z_t, the sum of a place over the seconds of all ages a with a wave that takes L to
+arrive, f = floor(L), is
+
+    sum_a exp(-|a - L| / tau) z_{t-a} = exp(-L / tau) P_t
+        + exp(-(L - f) / tau) sum_{a=1..f} (1 - r^2) r^{f-a} P_{t-a}
+        + (exp(-(f + 1 - L) / tau) - r exp(-(L - f) / tau)) P_{t-f-1}
+
+Deviations: the noise carried through the kernel, with both means as if perfectly correlated, and
+what the mean smooths away, in the variance
+
+    k_1 (a_1 n^(1/2) / l^2 + a_2 (rho_jam - rho_free)^2)      of densities,
+    k_2 (b_1 / (1 + n) + b_2 (v_jam - v_free)^2)              of speeds.
+
+With n = rho l vehicles in a segment, their number flickers less than that of a Poisson process, and
+their mean speed the less the more they are. The coefficients are fitted to training traffic of the
+package's roads. The factors k of a segment follow its innovations e, of variance noise + k M, in a
+memory that fades:
+
+    k = (K + sum M (e^2 - noise) / (noise + M)^2) / (K + sum M^2 / (noise + M)^2)
+
+held to 1 to 10: they stay at 1 where noise hides what is smoothed away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.settings import AdaptiveSmoothingSettings, EstimatorSettings
+from dptse_env.estimators.simple import estimated_traffic
+from dptse_env.model import ARZModel
+from dptse_env.model.parameters import SECONDS_PER_HOUR
+from dptse_env.model.step import pressure
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import Bundle, all_finite, kernel, kernel_part
+
+REACH = 3.0
+"""Distance of the furthest neighbours, in s: they weigh a twentieth of the place itself."""
+LEAST_DENSITY = 15.0
+"""Density of a lane [veh/km] below which a flow is mostly noise."""
+LEAST_WEIGHT = 1e-100
+FREE, JAM = 0, 1
+WEIGHT, DENSITY, SPEED, DENSITY_NOISE, SPEED_NOISE = range(5)
+"""Sums: of weights, of weights times values, and of squared weights times variances of noise."""
+DENSITY_MODEL = 0.8, 0.5
+SPEED_MODEL = 310.0, 0.4
+"""Coefficients a [veh^(3/2), 1] and b [(km/h)^2, 1] of the variance that is smoothed away."""
+MEMORY, CONFIDENCE = 300.0, 0.3
+"""Seconds in which the factors forget, and K: how many innovations without noise k = 1 is worth."""
+LARGEST_FACTOR = 10.0
+"""Range of the factors from 1 on: calm traffic does not make the next jam known."""
+
+
+class Stencil(NamedTuple):
+    """Where the J places of values are, S segments and then the ends, and how they count."""
+
+    target: IntArray  # (Q,) segments that values count for, by place, then by delay
+    wave: IntArray  # (Q,) FREE or JAM
+    delay: IntArray  # (Q,) f, whole steps that the wave takes to arrive
+    weight: FloatArray  # (Q, 2, 3) factors of P_t, the sum and P_{t-f-1}; and for squared weights
+    first: IntArray  # (J + 1,) where the entries of each place begin
+    lanes: FloatArray  # (S,)
+    jam: FloatArray  # (S,) largest densities [veh/km]
+    lengths: FloatArray  # (S,) [km]
+    limits: FloatArray  # (S,) speed limits [km/h]
+    row_first: IntArray  # (M,) first segment of each row of a measurement
+    row_span: IntArray  # (M,) segments of each row
+    flows: bool  # whether flows are released, otherwise speeds
+    decay: float  # r
+    threshold: float  # V
+    transition: float  # dV
+    largest_speed: float
+    forgetting: float  # of the factors in a step
+
+
+class Ends(NamedTuple):
+    """The ends of the road, and what the model's inputs say of them."""
+
+    entries: IntArray  # (1 + I,) segments
+    entry_inputs: IntArray  # (1 + I,) columns of the demands, before those of w
+    entry_jam: FloatArray  # (1 + I,) jam densities outside [veh/km]
+    entry_lanes: FloatArray  # (1 + I,)
+    exits: IntArray  # (1 + O,) segments
+    exit_inputs: IntArray  # (1 + O,) columns of the densities
+    exit_jam: FloatArray  # (1 + O,)
+    exit_lanes: FloatArray  # (1 + O,)
+    jam: FloatArray  # (S,) jam densities [veh/km]
+    free_flow_speed: float
+    gamma: float
+    weight: float
+
+
+class State(NamedTuple):
+    """The sums and estimates of n episodes."""
+
+    past: FloatArray  # (n, J, H, 5) P of the last H steps, each in turn
+    place: IntArray  # (n,) where the present one is
+    sums: FloatArray  # (n, S, 2, 5) of both waves
+    present: FloatArray  # (n, S, 4) density, speed and their deviations
+    smoothed: FloatArray  # (n, S, 2) variances of what is smoothed away, without their factors
+    evidence: FloatArray  # (n, S, 2, 2) sums of the factors' numerators and denominators
+    innovations: FloatArray  # (n, M, 2)
+    diverged: BoolArray  # (n,)
+
+
+class AdaptiveSmoothing(BatchEstimator):
+    """Adaptive smoothing of released values.
+
+    It has no traffic model; the ARZ parameters serve to read densities and speeds off the model's
+    inputs. Errors of different segments and of density and speed count as independent.
+
+    Attributes:
+        state: Sums and estimates, which predictions and updates change in place.
+    """
+
+    is_compiled: ClassVar[bool] = True
+    has_demand: ClassVar[bool] = False
+    steps_model: ClassVar[bool] = False
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        stencil, n, S = make_stencil(model, settings.asm), n_episodes, model.n_segments
+        shape = n, stencil.first.size - 1, int(stencil.delay.max()) + 2, 5
+        self.state = State(
+            past=np.zeros(shape),
+            place=np.zeros(n, dtype=np.int64),
+            sums=np.zeros((n, S, 2, 5)),
+            present=np.zeros((n, S, 4)),
+            smoothed=np.zeros((n, S, 2)),
+            evidence=np.zeros((n, S, 2, 2)),
+            innovations=self.innovations,
+            diverged=self.diverged,
+        )
+        self._prior = np.zeros((n, S, 4))
+        scale = np.array([model.density_scale, model.speed_scale])
+        self._prior[..., 2:] = np.sqrt(settings.initial_variance) * scale
+        self.state.present[:] = self._prior
+        self._bundle = Bundle(stencil, make_ends(model, settings.asm), self.state)
+
+    @property
+    def means(self) -> FloatArray:
+        """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
+        return self.state.present[..., :2]
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        density, speed = estimated_traffic(self.model, states)
+        self._prior[episodes, :, 0], self._prior[episodes, :, 1] = density, speed
+        self._restart(episodes)
+
+    def _restart(self, episodes: IntArray) -> None:
+        restart(self._bundle, episodes, self._prior)
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        predict(self._bundle, episodes, inputs)
+
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        observed, values, sigma, centre = measured
+        update(self._bundle, episodes, observed, values, sigma, centre)
+        lost = episodes[self.diverged[episodes]]
+        if lost.size > 0:
+            self._restart(lost)
+
+    def _estimate(self) -> Estimate:
+        return Estimate(*(self.state.present[..., j].copy() for j in range(4)))
+
+
+def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stencil:
+    """Return what the values of each place count for."""
+    layout, step = model.layout, model.time_step
+    lines: list[tuple[int, int, int, list[list[float]]]] = []
+    first = [0]
+    for reached in neighbours(model, REACH * settings.length):
+        found = []
+        for target, distance in reached.items():
+            spatial = math.exp(-abs(distance) / settings.length)
+            for wave, speed in ((FREE, settings.free_wave), (JAM, -settings.jam_wave)):
+                # A wave arrives late downstream of the place if it is free, else upstream.
+                lag = SECONDS_PER_HOUR * distance / speed
+                if lag > 0.0:
+                    factors = _factors(lag, settings.time, step, spatial)
+                    found.append((int(lag / step), target, wave, factors))
+                else:
+                    weight = spatial * math.exp(lag / settings.time)
+                    found.append((0, target, wave, [[weight, 0.0, 0.0], [weight**2, 0.0, 0.0]]))
+        found.sort(key=lambda entry: entry[:3])
+        lines += found
+        first.append(len(lines))
+    delay, target, wave = np.array([line[:3] for line in lines], dtype=np.int64).T.copy()
+    return Stencil(
+        target=target,
+        wave=wave,
+        delay=delay,
+        weight=np.array([line[3] for line in lines]),
+        first=np.array(first, dtype=np.int64),
+        lanes=layout.lanes,
+        jam=model.jam_density,
+        lengths=layout.lengths,
+        limits=np.array(model.network.speed_limits),
+        row_first=model.rows.first,
+        row_span=model.rows.span,
+        flows=model.reference_speed is not None,
+        decay=math.exp(-step / settings.time),
+        threshold=float(settings.threshold),
+        transition=float(settings.transition),
+        largest_speed=float(model.largest_speed),
+        forgetting=math.exp(-step / MEMORY),
+    )
+
+
+def _factors(lag: float, time: float, step: float, spatial: float) -> list[list[float]]:
+    """Return the factors of a wave that arrives after `lag` [s], of weights and their squares."""
+    whole, found = int(lag / step), []
+    for tau, base in ((time, spatial), (time / 2.0, spatial**2)):
+        rest = math.exp(-(lag - whole * step) / tau)
+        next_one = math.exp(-((whole + 1) * step - lag) / tau)
+        found.append(
+            [
+                base * math.exp(-lag / tau),
+                base * rest,
+                base * (next_one - math.exp(-step / tau) * rest),
+            ]
+        )
+    return found
+
+
+def neighbours(model: ARZModel, reach: float) -> Iterator[dict[int, float]]:
+    """Yield the segments within reach of each segment and then each end, entries before exits.
+
+    Along the mainline, or along the same ramp. An end is half a segment beyond the road.
+
+    Yields:
+        Distances [km] of segments by index: positive downstream.
+    """
+    layout, network = model.layout, model.network
+    n = network.n_mainline
+    chains = [list(range(n)), *network.on_ramp_segments, *network.off_ramp_segments]
+    chain_of = {s: list(chain) for chain in chains for s in chain}
+    centre: dict[int, float] = {}
+    for chain in chains:
+        ends = np.cumsum(layout.lengths[list(chain)])
+        middles = (ends - 0.5 * layout.lengths[list(chain)]).tolist()
+        centre |= dict(zip(chain, middles, strict=True))
+    places = [(s, centre[s]) for s in range(layout.n_segments)]
+    places += [(s, centre[s] - layout.lengths[s]) for s in layout.entries.tolist()]
+    places += [(s, centre[s] + layout.lengths[s]) for s in layout.exits.tolist()]
+    for segment, x in places:
+        distances = {s: centre[s] - x for s in chain_of[segment]}
+        yield {s: d for s, d in distances.items() if abs(d) <= reach}
+
+
+def make_ends(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Ends:
+    """Return the ends of a model's road."""
+    layout, parameters = model.layout, model.parameters
+    return Ends(
+        entries=layout.entries,
+        entry_inputs=layout.entry_inputs,
+        entry_jam=model.entry_jam_density,
+        entry_lanes=layout.entry_lanes,
+        exits=layout.exits,
+        exit_inputs=layout.exit_inputs,
+        exit_jam=model.exit_jam_density,
+        exit_lanes=layout.exit_lanes,
+        jam=model.jam_density,
+        free_flow_speed=float(parameters.free_flow_speed),
+        gamma=float(parameters.gamma),
+        weight=float(settings.boundary_weight),
+    )
+
+
+@kernel
+def restart(bundle: Bundle, episodes: IntArray, prior: FloatArray) -> None:
+    """Begin episodes `(k,)` with their prior `(n, S, 4)` as the values of a second."""
+    stencil, _, state = bundle.parts
+    for k in range(episodes.size):
+        e = episodes[k]
+        past = state.past[e]
+        past[:] = 0.0
+        state.place[e] = 0
+        state.evidence[e] = CONFIDENCE
+        state.innovations[e] = 0.0
+        for s in range(stencil.lanes.size):
+            lanes, known = stencil.lanes[s], past[s, 0]
+            known[WEIGHT] = 1.0
+            known[DENSITY], known[SPEED] = prior[e, s, 0] / lanes, prior[e, s, 1]
+            known[DENSITY_NOISE] = (prior[e, s, 2] / lanes) ** 2
+            known[SPEED_NOISE] = prior[e, s, 3] ** 2
+            for j in range(4):
+                state.present[e, s, j] = prior[e, s, j]
+            state.smoothed[e, s] = 0.0
+
+
+@kernel
+def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
+    """Let values age by a step, and add what inputs `(k, n_u)` say of the ends."""
+    stencil, ends, state = bundle.parts
+    for k in range(episodes.size):
+        e = episodes[k]
+        past, present = state.past[e], state.present[e]
+        before, H = state.place[e], past.shape[1]
+        place = before + 1 if before + 1 < H else 0
+        state.place[e] = place
+        for j in range(past.shape[0]):
+            old, new = past[j, before], past[j, place]
+            # What nothing has followed for hours no longer fades, so that its mean stays.
+            r = stencil.decay if old[WEIGHT] > LEAST_WEIGHT else 1.0
+            for c in range(DENSITY_NOISE):
+                new[c] = r * old[c]
+            for c in range(DENSITY_NOISE, 5):
+                new[c] = r * r * old[c]
+        if ends.weight > 0.0:
+            _read_ends(ends, inputs[k], present, past, place, stencil.lanes)
+        for s in range(stencil.lanes.size):
+            for i in range(2):
+                for j in range(2):
+                    # Evidence fades towards none, which is the factor 1.
+                    kept = state.evidence[e, s, i, j] - CONFIDENCE
+                    state.evidence[e, s, i, j] = CONFIDENCE + stencil.forgetting * kept
+        _sum(stencil, past, place, state.sums[e])
+        _evaluate(stencil, state, e)
+
+
+@kernel_part
+def _read_ends(
+    ends: Ends,
+    inputs: FloatArray,
+    present: FloatArray,
+    past: FloatArray,
+    place: int,
+    lanes: FloatArray,
+) -> None:
+    """Add the values of the ends."""
+    v_f, gamma, weight, S = ends.free_flow_speed, ends.gamma, ends.weight, lanes.size
+    for b in range(ends.entries.size):
+        column = ends.entry_inputs[b]
+        w = inputs[column + 1]
+        rho = entry_density(inputs[column], w, v_f, gamma, ends.entry_jam[b])
+        new = past[S + b, place]
+        new[WEIGHT] += weight
+        new[DENSITY] += weight * rho / ends.entry_lanes[b]
+        new[SPEED] += weight * (w - pressure(rho, ends.entry_jam[b], v_f, gamma))
+    for b in range(ends.exits.size):
+        s, rho = ends.exits[b], inputs[ends.exit_inputs[b]]
+        w = present[s, 1] + pressure(present[s, 0], ends.jam[s], v_f, gamma)
+        new = past[S + ends.entries.size + b, place]
+        new[WEIGHT] += weight
+        new[DENSITY] += weight * rho / ends.exit_lanes[b]
+        new[SPEED] += weight * max(w - pressure(rho, ends.exit_jam[b], v_f, gamma), 0.0)
+
+
+@kernel_part
+def entry_density(demand: float, w: float, v_f: float, gamma: float, jam: float) -> float:
+    """Return the density [veh/km] at which drivers of some w send a demand [veh/h] freely.
+
+    The smaller root of rho (w - p(rho)) = demand, by Newton's method from below, where the function
+    is concave; the critical density where the demand is the largest that they can send.
+    """
+    critical: float = jam * (max(w, 0.0) / ((1.0 + gamma) * v_f)) ** (1.0 / gamma)
+    if demand >= (1.0 - 1e-9) * critical * w * gamma / (1.0 + gamma):
+        return critical
+    rho = demand / w
+    for _ in range(60):
+        p = pressure(rho, jam, v_f, gamma)
+        change = (demand - rho * (w - p)) / (w - (1.0 + gamma) * p)
+        rho += change
+        if change <= 1e-12 * rho:
+            break
+    held: float = min(rho, critical)
+    return held
+
+
+@kernel_part
+def _sum(stencil: Stencil, past: FloatArray, place: int, sums: FloatArray) -> None:
+    """Sum the values that count for each segment."""
+    r, H = stencil.decay, past.shape[1]
+    r2 = r * r
+    sums[:] = 0.0
+    for j in range(past.shape[0]):
+        own, now = past[j], past[j, place]
+        a, t = 0, place
+        # Sums of P over the ages up to a, the latest of the least weight.
+        w, x, y, n, o = 0.0, 0.0, 0.0, 0.0, 0.0
+        for q in range(stencil.first[j], stencil.first[j + 1]):
+            while a < stencil.delay[q]:
+                a += 1
+                t = t - 1 if t > 0 else H - 1
+                w = r * w + (1.0 - r2) * own[t, 0]
+                x = r * x + (1.0 - r2) * own[t, 1]
+                y = r * y + (1.0 - r2) * own[t, 2]
+                n = r2 * n + (1.0 - r2 * r2) * own[t, 3]
+                o = r2 * o + (1.0 - r2 * r2) * own[t, 4]
+            old = own[t - 1 if t > 0 else H - 1]
+            out, f = sums[stencil.target[q], stencil.wave[q]], stencil.weight[q]
+            out[0] += f[0, 0] * now[0] + f[0, 1] * w + f[0, 2] * old[0]
+            out[1] += f[0, 0] * now[1] + f[0, 1] * x + f[0, 2] * old[1]
+            out[2] += f[0, 0] * now[2] + f[0, 1] * y + f[0, 2] * old[2]
+            out[3] += f[1, 0] * now[3] + f[1, 1] * n + f[1, 2] * old[3]
+            out[4] += f[1, 0] * now[4] + f[1, 1] * o + f[1, 2] * old[4]
+
+
+@kernel_part
+def _evaluate(stencil: Stencil, state: State, e: int) -> None:
+    """Write the estimates of an episode, and their deviations."""
+    sums, present, smoothed = state.sums[e], state.present[e], state.smoothed[e]
+    for s in range(stencil.lanes.size):
+        free, jam, lanes = sums[s, FREE], sums[s, JAM], stencil.lanes[s]
+        by_free, by_jam = 1.0 / free[WEIGHT], 1.0 / jam[WEIGHT]
+        v_free, v_jam = by_free * free[SPEED], by_jam * jam[SPEED]
+        m = stencil.threshold - min(v_free, v_jam)
+        m = 0.5 + 0.5 * math.tanh(m / stencil.transition)
+        by_free, by_jam = (1.0 - m) * by_free, m * by_jam
+        rho = lanes * (by_free * free[DENSITY] + by_jam * jam[DENSITY])
+        gap = lanes * (jam[DENSITY] / jam[WEIGHT] - free[DENSITY] / free[WEIGHT])
+        present[s, 0] = rho = min(max(rho, 0.0), stencil.jam[s])
+        present[s, 1] = min(max(m * v_jam + (1.0 - m) * v_free, 0.0), stencil.largest_speed)
+        length = stencil.lengths[s]
+        vehicles = rho * length
+        flicker = DENSITY_MODEL[0] * math.sqrt(vehicles) / length**2
+        smoothed[s, 0] = flicker + DENSITY_MODEL[1] * gap**2
+        flicker = SPEED_MODEL[0] / (1.0 + vehicles)
+        smoothed[s, 1] = flicker + SPEED_MODEL[1] * (v_jam - v_free) ** 2
+        for i in range(2):
+            noise = by_free * math.sqrt(max(free[DENSITY_NOISE + i], 0.0))
+            noise += by_jam * math.sqrt(max(jam[DENSITY_NOISE + i], 0.0))
+            if i == 0:
+                noise *= lanes
+            factor = _factor(state.evidence[e, s, i])
+            present[s, 2 + i] = math.sqrt(noise**2 + factor * smoothed[s, i])
+
+
+@kernel_part
+def _factor(evidence: FloatArray) -> float:
+    """Return the factor k of a segment, at least 1."""
+    factor: float = min(max(evidence[0] / evidence[1], 1.0), LARGEST_FACTOR)
+    return factor
+
+
+@kernel
+def update(
+    bundle: Bundle,
+    episodes: IntArray,
+    observed: BoolArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+) -> None:
+    """Add what was released to the sums, and evaluate them; the arguments are a `Measurement`'s."""
+    stencil, _, state = bundle.parts
+    value = np.empty(5)
+    added = np.empty((stencil.lanes.size, 5))
+    for k in range(episodes.size):
+        e = episodes[k]
+        state.innovations[e] = 0.0
+        added[:] = 0.0
+        for m in range(stencil.row_first.size):
+            if observed[k, m]:
+                _read_row(stencil, state, e, m, values[k, m], sigma[k, m], centre[k], value)
+                for s in range(stencil.row_first[m], stencil.row_first[m] + stencil.row_span[m]):
+                    for c in range(5):
+                        added[s, c] += value[c]
+        for s in range(stencil.lanes.size):
+            if added[s, WEIGHT] > 0.0:
+                _add(stencil, state, e, s, added[s])
+        # Estimates are clipped, so that they do not show it.
+        state.diverged[e] = not all_finite(state.sums[e].reshape(-1))
+        _evaluate(stencil, state, e)
+
+
+@kernel_part
+def _read_row(
+    stencil: Stencil,
+    state: State,
+    e: int,
+    m: int,
+    values: FloatArray,
+    sigma: FloatArray,
+    centre: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write a row's innovations, what they say of the factors, and its value for each segment.
+
+    Each segment has the average of the row, with a weight and a variance as if the segments' were
+    independent values.
+    """
+    first, span = stencil.row_first[m], stencil.row_span[m]
+    present, share = state.present[e], 1.0 / span
+    lanes, rho, rho_variance, rho_smoothed = 0.0, 0.0, 0.0, 0.0
+    y, y_variance, y_smoothed, carried, least = 0.0, 0.0, 0.0, 0.0, 0.0
+    for s in range(first, first + span):
+        density, speed = present[s, 0], present[s, 1]
+        lanes += share * stencil.lanes[s]
+        rho += share * density
+        rho_variance += (share * present[s, 2]) ** 2
+        rho_smoothed += share**2 * state.smoothed[e, s, 0]
+        floored = max(density, LEAST_DENSITY * stencil.lanes[s])
+        by_speed, slip = 1.0, 0.0
+        if stencil.flows:
+            by_speed, slip = floored, speed - centre[s]
+            carried += share * (density * centre[s] + (floored - density) * stencil.limits[s])
+        y += share * (density * slip if stencil.flows else speed)
+        y_variance += share**2 * ((by_speed * present[s, 3]) ** 2 + (slip * present[s, 2]) ** 2)
+        y_smoothed += share**2 * by_speed**2 * state.smoothed[e, s, 1]
+        least += share * floored
+    by_flow = 1.0 / least if stencil.flows else 1.0
+    out[WEIGHT] = share
+    out[DENSITY] = share * values[0] / lanes
+    out[SPEED] = share * by_flow * (values[1] + carried)
+    out[DENSITY_NOISE] = share * (sigma[0] / lanes) ** 2
+    out[SPEED_NOISE] = share * (by_flow * sigma[1]) ** 2
+    for i in range(2):
+        error = values[0] - rho if i == 0 else values[1] - y
+        noise = sigma[i] ** 2
+        variance = noise + (rho_variance if i == 0 else y_variance)
+        if not 0.0 < variance < np.inf:
+            continue
+        state.innovations[e, m, i] = error / math.sqrt(variance)
+        smoothed = rho_smoothed if i == 0 else y_smoothed
+        for s in range(first, first + span):
+            evidence = state.evidence[e, s, i]
+            known = variance - _factor(evidence) * smoothed
+            gain = smoothed / (known + smoothed) ** 2
+            evidence[0] += gain * (error**2 - known)
+            evidence[1] += gain * smoothed
+
+
+@kernel_part
+def _add(stencil: Stencil, state: State, e: int, s: int, value: FloatArray) -> None:
+    """Add the value of a segment to the sums."""
+    now, sums = state.past[e, s, state.place[e]], state.sums[e]
+    for c in range(5):
+        now[c] += value[c]
+    for q in range(stencil.first[s], stencil.first[s + 1]):
+        out, f = sums[stencil.target[q], stencil.wave[q]], stencil.weight[q]
+        for c in range(DENSITY_NOISE):
+            out[c] += f[0, 0] * value[c]
+        for c in range(DENSITY_NOISE, 5):
+            out[c] += f[1, 0] * value[c]

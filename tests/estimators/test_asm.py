@@ -1,0 +1,302 @@
+"""Adaptive smoothing beside its equations, and what it gives."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dptse_env.estimators import AdaptiveSmoothingSettings, EstimatorSettings
+from dptse_env.estimators.asm import (
+    CONFIDENCE,
+    DENSITY_MODEL,
+    LARGEST_FACTOR,
+    LEAST_DENSITY,
+    MEMORY,
+    REACH,
+    SPEED_MODEL,
+    entry_density,
+)
+from dptse_env.model import ARZModel, load_parameters
+from dptse_env.traffic import PAPER_HIGHWAY
+from tests.helpers import UNEVEN, Road, compiled
+from tests.model.oracle import PAPER
+
+from .helpers import Episodes, assert_same, run, show, simulate, started, step
+
+ASM = AdaptiveSmoothingSettings(
+    time=6.0, length=0.15, free_wave=90.0, jam_wave=15.0, threshold=55.0, boundary_weight=0.7
+)
+
+
+def smoothing(**changes):
+    return EstimatorSettings(asm=replace(AdaptiveSmoothingSettings(), **changes))
+
+
+def chains_of(network):
+    ramps = (*network.on_ramp_segments, *network.off_ramp_segments)
+    return [tuple(range(network.n_mainline)), *map(tuple, ramps)]
+
+
+class Textbook:
+    """One episode, by sums over all values, as the module's docstring has them.
+
+    A value is (chain, place [km], step, weight, what it is of each quantity, the variances of its
+    noise). Quantities are densities per lane and speeds.
+    """
+
+    def __init__(self, model, start, settings):
+        self.model, self.settings, self.t = model, settings.asm, 0
+        network, layout = model.network, model.layout
+        self.chain, self.x = np.zeros((2, model.n_segments))
+        for i, chain in enumerate(chains_of(network)):
+            lengths = layout.lengths[list(chain)]
+            self.chain[list(chain)], self.x[list(chain)] = i, np.cumsum(lengths) - lengths / 2
+        traffic = np.stack([model.density(start[None])[0], model.speed(start[None])[0]], -1)
+        self.now = np.concatenate([traffic, np.zeros_like(traffic)], axis=1)
+        unit = np.array([model.density_scale, model.speed_scale])
+        variance = settings.initial_variance * unit**2
+        self.values = [
+            (self.chain[s], self.x[s], 0, 1.0, traffic[s] / [lanes, 1], variance / [lanes**2, 1])
+            for s, lanes in enumerate(layout.lanes)
+        ]
+        self.evidence = np.full((model.n_segments, 2, 2), CONFIDENCE)
+        self.smoothed = np.zeros((model.n_segments, 2))
+
+    def factors(self):
+        ratio = self.evidence[..., 0] / self.evidence[..., 1]
+        return np.clip(ratio, 1.0, LARGEST_FACTOR)
+
+    def evaluate(self):
+        model, constants = self.model, self.settings
+        lanes, lengths = model.layout.lanes, model.layout.lengths
+        chain, x, t, weight = (np.array([v[i] for v in self.values]) for i in range(4))
+        z, noise = (np.array([v[i] for v in self.values]) for i in (4, 5))
+        for s in range(model.n_segments):
+            means, deviations = [], []
+            gap = x - self.x[s]
+            near = (chain == self.chain[s]) & (np.abs(gap) <= REACH * constants.length)
+            for c in (constants.free_wave, -constants.jam_wave):
+                late = (t - self.t) * model.time_step - 3600.0 * gap / c
+                phi = np.exp(-np.abs(gap) / constants.length - np.abs(late) / constants.time)
+                phi = np.where(near, phi, 0.0)
+                total = (phi * weight).sum()
+                means.append((phi * weight) @ z / total)
+                deviations.append(np.sqrt(phi**2 @ noise) / total)
+            free, jam = means
+            m = constants.threshold - min(free[1], jam[1])
+            m = 0.5 * (1.0 + np.tanh(m / constants.transition))
+            density, speed = m * jam + (1.0 - m) * free
+            carried = m * deviations[1] + (1.0 - m) * deviations[0]
+            between = (jam - free) * [lanes[s], 1.0]
+            density = np.clip(lanes[s] * density, 0.0, model.jam_density[s])
+            n = density * lengths[s]
+            self.smoothed[s] = (
+                DENSITY_MODEL[0] * np.sqrt(n) / lengths[s] ** 2
+                + DENSITY_MODEL[1] * between[0] ** 2,
+                SPEED_MODEL[0] / (1.0 + n) + SPEED_MODEL[1] * between[1] ** 2,
+            )
+            variances = (carried * [lanes[s], 1.0]) ** 2 + self.factors()[s] * self.smoothed[s]
+            speed = np.clip(speed, 0.0, model.largest_speed)
+            self.now[s] = density, speed, *np.sqrt(variances)
+
+    def predict(self, inputs):
+        model, layout, weight = self.model, self.model.layout, self.settings.boundary_weight
+        self.t += 1
+        v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma
+        ends = []
+        for s, column, jam, lanes in zip(
+            layout.entries, layout.entry_inputs, model.entry_jam_density, layout.entry_lanes,
+            strict=True,
+        ):  # fmt: skip
+            demand, w = inputs[column : column + 2]
+            rho = np.linspace(0.0, jam * (w / v_f / (1.0 + gamma)) ** (1.0 / gamma), 100_001)
+            rho = np.interp(demand, rho * (w - v_f * (rho / jam) ** gamma), rho)
+            v = w - v_f * (rho / jam) ** gamma
+            ends.append((s, self.x[s] - layout.lengths[s], rho / lanes, v))
+        for s, column, jam, lanes in zip(
+            layout.exits, layout.exit_inputs, model.exit_jam_density, layout.exit_lanes,
+            strict=True,
+        ):  # fmt: skip
+            rho, (own, speed) = inputs[column], self.now[s, :2]
+            w = speed + v_f * (own / model.jam_density[s]) ** gamma
+            v = max(w - v_f * (rho / jam) ** gamma, 0.0)
+            ends.append((s, self.x[s] + layout.lengths[s], rho / lanes, v))
+        for s, x, rho, v in ends:
+            self.values.append((self.chain[s], x, self.t, weight, np.array([rho, v]), np.zeros(2)))
+        self.evidence = CONFIDENCE + np.exp(-model.time_step / MEMORY) * (
+            self.evidence - CONFIDENCE
+        )
+        self.evaluate()
+
+    def update(self, observed, values, sigma, centre):
+        """Return innovations."""
+        model, innovations = self.model, np.zeros(values.shape)
+        lanes, flows = model.layout.lanes, model.reference_speed is not None
+        density, speed, density_std, speed_std = self.now.T
+        floored = np.maximum(density, LEAST_DENSITY * lanes)
+        evidence = self.evidence.copy()
+        for m in np.flatnonzero(observed):
+            H = model.rows.weights[m]
+            covered = np.flatnonzero(H)
+            slip = speed - centre if flows else np.zeros(len(speed))
+            by_speed = floored if flows else np.ones(len(speed))
+            y = H @ (density * slip) if flows else H @ speed
+            v = values[m, 1]
+            if flows:
+                added = (floored - density) * model.network.speed_limits
+                v = (v + H @ (density * centre + added)) / (H @ floored)
+            z = np.array([values[m, 0] / (H @ lanes), v])
+            noise = np.array([sigma[m, 0] / (H @ lanes), sigma[m, 1] / (H @ by_speed)]) ** 2
+            errors = values[m] - [H @ density, y]
+            variances = sigma[m] ** 2 + [
+                H**2 @ density_std**2,
+                H**2 @ ((by_speed * speed_std) ** 2 + (slip * density_std) ** 2),
+            ]
+            innovations[m] = errors / np.sqrt(variances)
+            smoothed = [
+                H**2 @ self.smoothed[:, 0], H**2 @ (by_speed**2 * self.smoothed[:, 1])
+            ]  # fmt: skip
+            for s in covered:
+                # As many values as segments, of the row's variance times their number.
+                variance = noise * len(covered) * H[s] ** 2
+                self.values.append((self.chain[s], self.x[s], self.t, H[s], z, variance))
+                for i in range(2):
+                    ratio = evidence[s, i, 0] / evidence[s, i, 1]
+                    rest = variances[i] - np.clip(ratio, 1.0, LARGEST_FACTOR) * smoothed[i]
+                    gain = smoothed[i] / (rest + smoothed[i]) ** 2
+                    evidence[s, i] += gain * np.array([errors[i] ** 2 - rest, smoothed[i]])
+        self.evidence = evidence
+        self.evaluate()
+        return innovations
+
+
+def held_to_the_equations(episodes, settings, n_steps):
+    model, close = episodes.model, {"rtol": 1e-9, "atol": 1e-9}
+    smoother = started("asm", "compiled", episodes, settings)
+    textbook = Textbook(model, episodes.start[0], settings)
+    centre = np.full((n_steps, 1, model.n_segments), np.nan)
+    if model.reference_speed is not None:
+        centre[:] = model.reference_speed if episodes.centre is None else episodes.centre
+    for k in range(n_steps):
+        step(smoother, episodes, k)
+        textbook.predict(episodes.inputs[k, 0])
+        given = (array[k, 0] for array in (episodes.observed, episodes.values, episodes.sigma))
+        found = textbook.update(*given, centre[k, 0])
+        shown = np.stack(smoother.estimate(), axis=-1)[0]
+        np.testing.assert_allclose(shown, textbook.now, **close)
+        np.testing.assert_allclose(smoother.innovations[0], found, **close)
+
+
+@pytest.mark.parametrize(
+    ("release", "road"), [("speed", PAPER_HIGHWAY), ("flow", PAPER_HIGHWAY), ("rows", UNEVEN)]
+)
+def test_it_is_the_sum_over_all_values_that_its_equations_say(release, road):
+    episodes = simulate("paper", n_steps=60, noise=1.5, release=release, road=road)
+    held_to_the_equations(episodes, EstimatorSettings(asm=ASM), 60)
+
+
+# What it gives ------------------------------------------------------------------------------------
+
+
+def on_a_road(n_steps, observed, values, parameters=PAPER, **fields):
+    """An episode of values (T or 1, S, 2) whose inputs say of the ends what is measured first."""
+    model = ARZModel(Road(**fields), parameters)
+    S = model.n_segments
+    density, speed = (np.full((1, model.n_boundaries), values[0, 0, i]) for i in range(2))
+    start = model.states(np.full((1, S), values[0, 0, 0]), np.full((1, S), values[0, 0, 1]))
+    inputs = np.tile(model.boundary_inputs(density, speed), (n_steps, 1, 1))
+    shape = n_steps, 1, S
+    return Episodes(
+        model, start, inputs, np.empty(0), np.broadcast_to(observed, shape),
+        np.broadcast_to(values[:, None], (*shape, 2)).copy(), np.full((*shape, 2), 1e-3),
+    )  # fmt: skip
+
+
+def test_traffic_that_stays_as_it_is_is_found_from_half_of_its_segments():
+    observed, values = np.arange(15) % 2 == 0, np.tile([45.0, 70.0], (1, 15, 1))
+    episodes = on_a_road(40, observed, values)
+    smoother = started("asm", "compiled", episodes)
+    run(smoother, episodes, range(40))
+    said = smoother.estimate()
+    np.testing.assert_allclose(said.density, 45.0, rtol=1e-9)
+    np.testing.assert_allclose(said.speed, 70.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("speed", "wave", "way"), [(15.0, 18.0, -1), (95.0, 120.0, 1)])
+def test_changes_travel_with_the_wave_of_the_traffic(speed, wave, way):
+    """Of three segments the middle one is measured, and a neighbour learns of it later."""
+    values = np.tile([30.0, speed], (120, 3, 1))
+    values[60:, :, 0] = 60.0
+    episodes = on_a_road(120, np.arange(3) == 1, values, n_mainline=3)
+    smoother = started("asm", "compiled", episodes, smoothing(time=1.0, boundary_weight=0.0))
+    found = []
+    run(smoother, episodes, range(120), lambda _: found.append(smoother.estimate().density[0]))
+    upstream, own, downstream = np.array(found).T
+    assert own[59] < 31.0
+    assert own[64] > 59.0
+    late, early = (downstream, upstream) if way > 0 else (upstream, downstream)
+    arrival = 59.0 + 3600.0 * 0.1 / wave
+    assert np.abs(np.interp(45.0, late, np.arange(120)) - arrival) < 1.0
+    np.testing.assert_allclose(early, own, atol=1.0)
+
+
+def test_a_mean_stays_when_nothing_follows_for_long():
+    """Weights fall by exp(-10) each second, to less than the smallest number."""
+    episodes = simulate("paper", n_steps=200)
+    smoother = started("asm", "compiled", episodes, smoothing(time=0.1, boundary_weight=0.0))
+    run(smoother, episodes, range(12))
+    nothing = np.zeros((1, 19), bool)
+    run(smoother, episodes, range(12, 150), observed=nothing)
+    before = smoother.estimate()
+    run(smoother, episodes, range(150, 200), observed=nothing)
+    assert not smoother.diverged.any()
+    after = smoother.estimate()
+    np.testing.assert_allclose(after.density, before.density, rtol=1e-9)
+    np.testing.assert_allclose(after.speed, before.speed, rtol=1e-9)
+
+
+@pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
+def test_the_density_of_an_entry_is_read_off_the_inputs(parameters):
+    """Up to the critical one: of a congested entry the inputs say no more."""
+    parameters = load_parameters(parameters)
+    model = ARZModel(Road(n_mainline=3), parameters)
+    v_f, gamma, jam = parameters.free_flow_speed, parameters.gamma, model.entry_jam_density[0]
+    density = np.linspace(0.0, 0.9 * jam, 60)
+    speed = 0.9 * v_f * np.maximum(1.0 - (density / jam) ** gamma, 0.0)
+    w = speed + v_f * (density / jam) ** gamma
+    inputs = model.boundary_inputs(np.tile(density, (2, 1)).T, np.tile(speed, (2, 1)).T)
+    critical = jam * (w / v_f / (1.0 + gamma)) ** (1.0 / gamma)
+    read = compiled(entry_density)
+    found = [read(demand, each, v_f, gamma, jam) for demand, each in inputs[:, :2]]
+    np.testing.assert_allclose(found, np.minimum(density, critical), rtol=1e-4, atol=1e-9)
+
+
+def test_without_weight_the_inputs_change_nothing():
+    episodes = simulate(n_steps=20)
+    one, other = (
+        started("asm", "compiled", episodes, smoothing(boundary_weight=0.0)) for _ in range(2)
+    )
+    run(one, episodes, range(20))
+    run(other, episodes, range(20), inputs=0.5 * episodes.inputs[0])
+    assert_same(show(one), show(other))
+
+
+def test_errors_that_are_larger_than_expected_raise_the_deviations():
+    """Where noise does not hide them: of the densities of half of the segments."""
+    rng = np.random.default_rng(0)
+    values = np.tile([45.0, 70.0], (300, 15, 1))
+    calm = on_a_road(300, True, values)
+    values[..., :8, 0] += 60.0 * rng.choice([-1.0, 1.0], (300, 8))
+    wild = on_a_road(300, True, values)
+    noise = replace(wild, sigma=np.full(wild.sigma.shape, 500.0))
+    found = []
+    for episodes in (calm, wild, noise):
+        smoother = started("asm", "compiled", episodes)
+        run(smoother, episodes, range(300))
+        found.append(np.sqrt(smoother.state.smoothed[0, :15, 0]))
+        found.append(smoother.estimate().density_std[0, :15])
+    expected, calm_std, base, wild_std, _, noise_std = found
+    np.testing.assert_allclose(calm_std, expected, rtol=1e-3)
+    assert (wild_std[:8] > 2.0 * base[:8]).all()
+    np.testing.assert_allclose(wild_std[8:11], base[8:11], rtol=0.5)
+    assert (noise_std > 20.0).all()
