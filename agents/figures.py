@@ -243,7 +243,6 @@ LABELS = {
     "blend": "EKF and random walk",
     "asm": "adaptive smoothing",
     "recurrent": "recurrent",
-    "asm": "adaptive smoothing",
     "open_loop": "open loop",
 }
 """Names of the estimators in figures and tables."""
