@@ -224,8 +224,8 @@ def notes_on(choice: Choice, fit: Fit) -> list[str]:
     """Say what the fit of the parameters gave, after they were chosen on validation traffic."""
     name = fit.parameters.name
     found = [
-        f"the search took the error x 1000 of an EKF on training traffic from {fit.start:.1f}, with "
-        f"{fit.parameters.derived_from}, to {fit.error:.1f}"
+        f"on training traffic the search took the error x 1000 of an EKF from {fit.start:.1f}, "
+        f"with {fit.parameters.derived_from}, to {fit.error:.1f}"
     ]
     if choice.parameters != name:
         errors = [
