@@ -219,6 +219,7 @@ class Network:
             write_corridor(temporary, road.corridor, comment=describe(road))
         print(describe(road))
         print(f"written: {self.output}")
+        print(f"next: {shlex.join(('dptse', 'fit', self.output.as_posix()))}")
 
     def _files(self) -> Files:
         if self.configuration is not None:

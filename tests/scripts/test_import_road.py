@@ -178,6 +178,7 @@ def test_a_network_becomes_a_road_of_any_environment(town):
     printed = run(*words, named, "--configuration", town / "own.sumocfg", "--path", "in ... out")
     assert "on-ramp at face 3: ramp-b" in printed
     assert "off-ramp at face 15: exit-a" in printed
+    assert f"next: dptse fit {shlex.quote(named.as_posix())}\n" in printed
     files = "--net", town / "road.net.xml", "--routes", town / "road.rou.xml"
     run(*words, given, *files, "--path", " ".join(PATH), "--step-length", "0.5")
     assert read_corridor(given).digest == read_corridor(named).digest
