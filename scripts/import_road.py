@@ -140,7 +140,12 @@ class Field:
         print_seeds(seeds)
         print(f"road: {self.output / ROAD}, segments of {corridor.segment_lengths[0]:g} km")
         print_next(
-            self.output / ROAD, seeds, corridor, PAPER, {"privacy": "corrected"}, fit_for=PAPER
+            self.output / ROAD,
+            seeds,
+            corridor,
+            PAPER,
+            {"privacy": "corrected"},
+            fit_for=f'{PAPER} {{"privacy": "corrected"}}',
         )
 
 
@@ -272,7 +277,7 @@ def print_next(
         corridor: The road.
         env: Id of an environment.
         keywords: Its keywords.
-        fit_for: Id to fit the road for, if not the one that a fit has by default.
+        fit_for: Environment to fit the road for, if not the one that a fit has by default.
     """
     missing = [name for name, own in seeds.items() if not own]
     if missing:
