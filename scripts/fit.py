@@ -224,9 +224,8 @@ def notes_on(choice: Choice, fit: Fit) -> list[str]:
     """Say what the fit of the parameters gave, after they were chosen on validation traffic."""
     name = fit.parameters.name
     found = [
-        f"an EKF errs {fit.error:.1f} x 10^-3 on training traffic with the fitted parameters, and "
-        f"{fit.start:.1f} with {fit.parameters.derived_from} for the lanes of the road, where the "
-        "search began"
+        f"on training traffic the search took the error x 1000 of an EKF from {fit.start:.1f}, "
+        f"with {fit.parameters.derived_from}, to {fit.error:.1f}"
     ]
     if choice.parameters != name:
         errors = [

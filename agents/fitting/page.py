@@ -165,7 +165,7 @@ def write(outcome: Outcome, rows: Sequence[Labels], place: Place) -> str:
         f"<p class='answer'>{escape(answer(choice))}</p>",
         f"<p>{escape(road.env.rpartition('/')[2])}, release model {escape(str(privacy.preset))} "
         f"with ε = {privacy.epsilon:g} and δ = {privacy.delta:g}, "
-        f"{road.keywords['bandwidth']} queries a second. The estimator, the parameters and the "
+        f"bandwidth {road.config.bandwidth}. The estimator, the parameters and the "
         "rule were chosen on validation traffic; all errors below are of test traffic, which was "
         f"played once. {escape(intervals)} χ² is the mean square of errors over the reported "
         "deviations: 1 is honest.</p>",

@@ -173,12 +173,11 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
     keywords = {k: v for k, v in road.environment.items() if k not in (*CHOSEN, "traffic_seeds")}
     keywords |= given
     base, decided, remarks = PRESETS[_preset(env)], list[str](), list[str]()
-    if "bandwidth" not in keywords:
-        keywords["bandwidth"] = min(base.bandwidth, max(corridor.n_mainline // 3, 1))
+    third = max(corridor.n_mainline // 3, 1)
+    if "bandwidth" not in keywords and third < base.bandwidth:
+        keywords["bandwidth"] = third
         decided.append("bandwidth")
-        remarks.append(
-            f"bandwidth {keywords['bandwidth']}: at most a third of the segments a second"
-        )
+        remarks.append(f"bandwidth {third}, a third of the segments")
     is_field = corridor.recordings is not None and not has_vehicles(corridor.recordings)
     needs_vehicles = RELEASE_MODELS.find(base.privacy.preset).needs_vehicles
     if is_field and needs_vehicles and "privacy" not in keywords:

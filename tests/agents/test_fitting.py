@@ -1,6 +1,9 @@
 """A road is fitted: what is searched, what is chosen, and what its file says afterwards."""
 
 import json
+import subprocess
+import sys
+import time
 import tomllib
 import warnings
 
@@ -21,7 +24,7 @@ from agents.play import Cell
 from agents.study import Place
 from dptse_env.model import load_parameters
 from dptse_env.traffic import RecordLibrary, read_road
-from tests.scripts.commands import refused, run_command
+from tests.scripts.commands import ROOT, refused, run_command
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
 ROAD = """# my road
@@ -130,6 +133,32 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
     assert len({str(each) for each in tried}) == len(tried) <= 60
     kept.unlink()
     assert fit_parameters(*arguments) == first
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows kills otherwise")
+def test_a_killed_fit_goes_on_with_what_it_has_tried(tmp_path):
+    path = tmp_path / "my-road.toml"
+    path.write_text(ROAD)
+    command = [sys.executable, "-m", "scripts.dptse", "fit", str(path), *BRIEF, "--tries", "20"]
+    kept = tmp_path / "my-road-fit" / "stages" / "search.json"
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
+        try:
+            deadline = time.monotonic() + 120
+            while not kept.exists() or len(json.loads(kept.read_text())) < 7:
+                assert time.monotonic() < deadline
+                assert process.poll() is None
+                time.sleep(0.02)
+        finally:
+            process.kill()
+    tried = json.loads(kept.read_text())
+    assert path.read_text() == ROAD
+    done = run_command(*command[3:])
+    assert done.returncode == 0, done.stderr
+    after = json.loads(kept.read_text())
+    assert after[: len(tried)] == tried
+    assert len(tried) < len(after) <= 21
+    assert "[environment]" in path.read_text()
 
 
 def error_of(given, tried):
