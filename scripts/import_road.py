@@ -139,7 +139,14 @@ class Field:
         )
         print_seeds(seeds)
         print(f"road: {self.output / ROAD}, segments of {corridor.segment_lengths[0]:g} km")
-        print_next(self.output / ROAD, seeds, corridor, PAPER, {"privacy": "corrected"})
+        print_next(
+            self.output / ROAD,
+            seeds,
+            corridor,
+            PAPER,
+            {"privacy": "corrected"},
+            fit_for=f'{PAPER} {{"privacy": "corrected"}}',
+        )
 
 
 @dataclass(frozen=True)
@@ -217,6 +224,7 @@ class Network:
             write_corridor(temporary, road.corridor, comment=describe(road))
         print(describe(road))
         print(f"written: {self.output}")
+        print(f"next: {shlex.join(('dptse', 'fit', self.output.as_posix()))}")
 
     def _files(self) -> Files:
         if self.configuration is not None:
@@ -259,7 +267,7 @@ def print_seeds(seeds: Mapping[str, tuple[int, ...]]) -> None:
 
 def print_next(
     road: Path, seeds: Mapping[str, Sequence[int]], corridor: Corridor, env: str,
-    keywords: Mapping[str, Any],
+    keywords: Mapping[str, Any], fit_for: str = "",
 ) -> None:  # fmt: skip
     """Print the commands that follow an import, with the traffic seeds that there are.
 
@@ -269,6 +277,7 @@ def print_next(
         corridor: The road.
         env: Id of an environment.
         keywords: Its keywords.
+        fit_for: Environment to fit the road for, if not the one that a fit has by default.
     """
     missing = [name for name, own in seeds.items() if not own]
     if missing:
@@ -279,7 +288,7 @@ def print_next(
         return
     given = {"bandwidth": min(2, corridor.n_mainline), **keywords, "corridor": road.as_posix()}
     first, last = seeds["test"][0], seeds["test"][-1]
-    fit = "fit", road.as_posix()
+    fit = "fit", road.as_posix(), *(("--env", fit_for) if fit_for else ())
     evaluate = "evaluate", "--env", f"{env} {json.dumps(given)}", "--seeds", f"{first}:{last + 1}"
     for words in (fit, evaluate):
         print(f"next: {shlex.join(('dptse', *words))}")
