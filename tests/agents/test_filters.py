@@ -349,7 +349,9 @@ def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_p
     assert ranges["span"] == [1.0, 2.0]
     assert ranges["flows"] == [1.0, 1.0]
     assert ranges["n_mainline"] == [6, 6]
-    plan = dataclasses.replace(PLAN, initial=str(path), rounds=(Round(OWN, 1, 1),), seed=5)
+    plan = dataclasses.replace(
+        PLAN, initial=str(path), teacher=0.5, rounds=(Round(OWN, 1, 1),), seed=5
+    )
     second = FilterTraining(plan, tmp_path / "b")
     for taken, given in zip(second.network.weights(), read_network(str(path)).network, strict=True):
         np.testing.assert_array_equal(taken, given)
