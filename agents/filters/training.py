@@ -36,7 +36,7 @@ WEIGHTS, PLAYED = "network.safetensors", "played.safetensors"
 """The trained network, and the network that the scenarios of a round are collected with."""
 SECTIONS = "sections"
 """Folder of the sections to validate on."""
-AVERAGING = 0.995
+AVERAGING = 0.998
 """Decay of the moving average of weights in an update. Batches differ so much that the last weights
 are biased towards the last batches: densities were 4 to 11 veh/km too large."""
 SHOWN_EVERY = 10
