@@ -42,8 +42,7 @@ class Args(Machines):
     """Score policies in the tasks of the query suite."""
 
     policies: tuple[str, ...] = ()
-    """Schedules; saved policies by file or shipped name, "module:Class", or
-    "module:Class=model.zip" of stable-baselines3, which is unpickled: load those that you trust."""
+    """Schedules; saved policies by file or shipped name; "module:Class"."""
     tasks: tuple[str, ...] = ()
     """Tasks by name; all of them if none is given."""
     output: Path = Path("results/my-suite")

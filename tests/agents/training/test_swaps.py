@@ -169,7 +169,7 @@ def policy():
 
 
 def planted(policy, gain=None, spent=None, n_states=300, trials=20):
-    """Swaps whose gain is that of their segments, ``gain(channels)`` of shape (m, 6), and noise."""
+    """Swaps whose gain is that of their segments, ``gain(inputs)`` of shape (m, 6), and noise."""
     generator = np.random.default_rng(0)
     size = policy.observation_space.shape[0]
     seen = generator.uniform(0.0, 0.3, size=(n_states, size)).astype(np.float32)
@@ -206,8 +206,8 @@ def centred(values):
 
 
 def test_scores_move_by_a_step_of_the_expected_gain(policy):
-    def gain(channels):
-        return 0.1 * np.tanh(channels[:, :, 0])
+    def gain(inputs):
+        return 0.1 * np.tanh(inputs[:, :, 0])
 
     swaps = planted(policy, gain)
     expected = centred(gain(policy.features(torch.from_numpy(swaps.observations)).numpy()))
@@ -216,8 +216,8 @@ def test_scores_move_by_a_step_of_the_expected_gain(policy):
 
 
 def test_budgets_have_their_price(policy):
-    def spent(channels):
-        return 8.0 * (channels[:, :, 0] > 0.0)
+    def spent(inputs):
+        return 8.0 * (inputs[:, :, 0] > 0.0)
 
     swaps = planted(policy, None, spent)
     expected = -0.01 * centred(spent(policy.features(torch.from_numpy(swaps.observations)).numpy()))
