@@ -57,9 +57,7 @@ def read_field(source: FieldSource, segments: int, lanes: int, speed_limit: floa
         OSError: A file cannot be read.
     """
     density, flow = source.read(lanes, speed_limit)
-    each = len(density) // (segments + 2)
-    if each < 1:
-        raise ValueError(f"segments must be at most {len(density) - 2}, got {segments}")
+    each = source.cells_of(segments, len(density))
     return Field(*by_second(density, flow, segments + 2, source.interval), each * source.cell)
 
 

@@ -23,13 +23,7 @@ from dptse_env.importers.fields import FieldSource
 from dptse_env.utils.fields import integer, parse_json, require
 
 ENV = "dptse_env:dptse/PaperHighway-v0"
-ESTIMATORS = (
-    "ekf",
-    "ukf",
-    "random_walk",
-    "blend",
-    "recurrent",
-)
+ESTIMATORS = ("ekf", "ukf", "random_walk", "blend", "asm", "recurrent")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,16 +78,21 @@ def main(args: Args) -> None:
     integer("window", args.window, 61, len(measured.density) - 1)
     road = {"corridor": field_corridor(measured, args.lanes, args.speed_limit)}
     given = args.keywords()
-    with quietly():
-        replays = {
-            name: Replay(
-                measured,
-                make_config(ENV, {**given, **road, "estimator": name}),
-                args.window,
-                args.repeats,
-            )
-            for name in args.estimators
-        }
+    try:
+        with quietly():
+            replays = {
+                name: Replay(
+                    measured,
+                    make_config(ENV, {**given, **road, "estimator": name}),
+                    args.window,
+                    args.repeats,
+                )
+                for name in args.estimators
+            }
+    except ValueError as problem:
+        if str(problem).startswith("corridor.segment_length"):
+            raise ValueError(f"segments must be fewer, got {args.segments}: {problem}") from problem
+        raise
     noise = next(iter(replays.values())).sigma
     scores = {name: replay.run() for name, replay in replays.items()}
     if args.json:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from dptse_env.importers.folder import (
     save_records,
 )
 from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
-from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.corridor import SHORTEST_SEGMENT, Corridor
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.roads import DENSITY_SCALE, write_corridor
@@ -151,6 +152,21 @@ class FieldSource:
                 stacklevel=3,
             )
         return density, flow
+
+    def cells_of(self, segments: int, cells: int) -> int:
+        """Return how many of the cells make one of `segments` + 2 segments.
+
+        Raises:
+            ValueError: There are too few cells, or segments would be too short.
+        """
+        each = cells // (segments + 2)
+        fewest = max(1, math.ceil(round(SHORTEST_SEGMENT / self.cell, 9)))
+        allowed = (
+            f"at most {cells // fewest - 2}, on {cells} cells of {self.cell:g} km, for segments of "
+            f"{SHORTEST_SEGMENT:g} km or more"
+        )
+        require(each >= fewest, "segments", allowed, segments)
+        return each
 
     def _check_unit(self, kind: str, odd: Callable[[float], str | None]) -> None:
         """Refuse data that are odd in the given unit, and name those in which they would not be.
@@ -327,8 +343,7 @@ def import_field(
     integer("duration", duration, 1)
     integer("segments", road.segments, 2)
     density, flow = source.read(road.lanes, road.speed_limit)
-    each = len(density) // (road.segments + 2)
-    require(each >= 1, "segments", f"at most {len(density) - 2}", road.segments)
+    each = source.cells_of(road.segments, len(density))
     field = np.stack(by_second(density, flow, road.segments + 2, source.interval), axis=-1)
     starts = range(0, len(field) - duration, duration + 1)
     require(len(starts) > 0, "duration", f"below the field's {len(field)} s", duration)

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import shutil
 import uuid
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from dptse_env.importers.source import Source
 from dptse_env.importers.tables import FORMATS
 from dptse_env.traffic.corridor import Corridor, Recordings
 from dptse_env.traffic.demand import Demand
-from dptse_env.traffic.imported import Kind, load_record, save_record, write_manifest
+from dptse_env.traffic.imported import Kind, load_record, ranges, save_record, write_manifest
 from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.fields import require, require_name
@@ -170,8 +171,23 @@ def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corr
 
     Raises:
         ValueError: No vehicle is on the mainline.
+
+    Warns:
+        UserWarning: No vehicle is ever on some of its segments.
     """
-    sums = np.mean([record.speed_sums.mean(axis=0) for record in records()], axis=0)
+    sums, counts = np.mean(
+        [(record.speed_sums.mean(axis=0), record.counts.mean(axis=0)) for record in records()],
+        axis=0,
+    )
+    empty = np.flatnonzero(counts[: corridor.n_mainline] == 0.0)
+    some = "with vehicles on the mainline in the first part of the windows"
+    require(len(empty) < corridor.n_mainline, "files", some, "none there")
+    if len(empty):
+        warnings.warn(
+            f"no vehicle is on the mainline's segments {ranges(empty + 1)} of "
+            f"{corridor.n_mainline}: are layout.origin and the unit of lengths right?",
+            stacklevel=3,
+        )
     flow = sums[: corridor.n_segments] / np.array(corridor.segment_lengths)
     shares = [
         flow[segments[0]] / max(flow[face - 1], 1e-9)

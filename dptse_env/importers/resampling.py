@@ -49,7 +49,7 @@ def whole_seconds(
         .with_columns(
             jumped=c("same")
             & ~c("paused")
-            & ((c("move") > FASTEST * c("wait") + JUMP) | (c("move") < -JUMP))
+            & (_too_far(c("move"), c("wait")) | _backwards(c("move")))
         )
         .with_columns(joined=c("same") & ~c("paused") & ~c("jumped"))
         .with_columns(chain=c("joined").not_().cum_sum().shift(1, fill_value=0))
@@ -100,6 +100,14 @@ def whole_seconds(
     return rows.select(wanted), _pieces(points, counts)
 
 
+def _too_far(move: pl.Expr, wait: pl.Expr) -> pl.Expr:
+    return move > FASTEST * wait + JUMP
+
+
+def _backwards(move: pl.Expr) -> pl.Expr:
+    return move < -JUMP
+
+
 def _between(name: str) -> pl.Expr:
     at, after = pl.col(name), pl.col(f"next_{name}")
     return pl.when(pl.col("share") > 0.0).then(at + pl.col("share") * (after - at)).otherwise(at)
@@ -119,7 +127,17 @@ def _in_order(points: pl.DataFrame, longest_gap: float, counts: Counter[str]) ->
     points = points.with_columns(twice=again.fill_null(False), near=near, track=pl.lit(0))
     counts["duplicates"] += points.filter("twice", "near").height
     points = points.filter((c("twice") & c("near")).not_())
-    ambiguous = points.filter("twice")["id"].unique()
+    # Positions that jump there and back are those of vehicles whose times alternate.
+    same, wait, move = c("id").diff() == 0, c("time").diff(), c("position").diff()
+    soon = same & (wait <= longest_gap)
+    points = points.with_columns(
+        there=(soon & _too_far(move, wait)).fill_null(False),
+        back=(soon & _backwards(move)).fill_null(False),
+    )
+    shared = points.group_by("id", maintain_order=True).agg(
+        c("twice").any(), jumps=pl.min_horizontal(c("there").sum(), c("back").sum())
+    )
+    ambiguous = shared.filter(c("twice") | (c("jumps") > 1))["id"]
     if len(ambiguous):
         kept = points.filter(c("id").is_in(ambiguous.implode()).not_())
         several = points.filter(c("id").is_in(ambiguous.implode()))
@@ -130,7 +148,7 @@ def _in_order(points: pl.DataFrame, longest_gap: float, counts: Counter[str]) ->
         several = several.with_columns(track=pl.Series(np.concatenate(tracks), dtype=pl.Int32))
         points = pl.concat([kept, several.filter(c("track") >= 0)], how="vertical_relaxed")
         points = points.sort("id", "track", "time")
-    return points.drop("twice", "near")
+    return points.drop("twice", "near", "there", "back")
 
 
 def _tracks(points: pl.DataFrame, longest_gap: float) -> IntArray:
@@ -237,7 +255,11 @@ def check_pieces(pieces: pl.DataFrame, where: str, units: Mapping[str, str]) -> 
     share = pieces.filter(pl.col("move") < 0.0).height / max(len(pieces), 1)
     if share > 0.1:
         told = "one direction must be chosen by source.where or source.groups"
-        told = "layout.reversed must be turned round" if share > 0.9 else told
+        if share > 0.9:
+            told = (
+                "layout.reversed must be turned round, and layout.origin be where the road begins "
+                "upstream"
+            )
         raise TrajectoryError(
             f"{where}: {told}, got positions that decrease for {100.0 * share:.0f} % of the "
             "vehicles"

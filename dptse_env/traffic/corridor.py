@@ -46,7 +46,9 @@ Face = Annotated[int, Interval(1, 999)]
 Lanes = Annotated[int, Interval(1, 16)]
 """Number of lanes."""
 # SUMO cannot drive an edge shorter than about a vehicle and its gap.
-Length = Annotated[float, Interval(0.04, 10)]
+SHORTEST_SEGMENT = 0.04
+"""Length of a segment at least [km]."""
+Length = Annotated[float, Interval(SHORTEST_SEGMENT, 10)]
 """Length of a segment [km]."""
 SpeedLimit = Annotated[float, Interval(1, 1000)]
 """A speed limit [km/h]."""

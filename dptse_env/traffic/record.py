@@ -296,7 +296,8 @@ def average_dwell(corridor: Corridor, records: Iterable[Record]) -> float:
     for record in records:
         more_present, more_passages = _dwell(record, corridor)
         present, passages = present + more_present, passages + more_passages
-    require(passages > 0.0, "records", "records with a vehicle on the mainline", passages)
+    brings = f"one that brings vehicles to the mainline of {corridor.name!r}"
+    require(passages > 0.0, "corridor.demand", brings, corridor.demand)
     return present / passages
 
 

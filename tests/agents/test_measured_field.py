@@ -35,7 +35,7 @@ def test_cells_become_segments_and_intervals_seconds(tmp_path):
     assert field.speed[0, 0] == pytest.approx(20.0 * 1.09728 * flow)
     turned = read_field(source(tmp_path, reversed=True), 3, 4, 50.0)
     np.testing.assert_allclose(turned.density, field.density[:, ::-1])
-    with pytest.raises(ValueError, match="segments must be at most 8, got 9"):
+    with pytest.raises(ValueError, match=r"segments must be at most 8, on 10 cells of 0\.05 km"):
         read_field(source(tmp_path), 9, 4, 50.0)
 
 

@@ -91,7 +91,7 @@ def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
         ({"density_unit": "cars"}, {}, 100, r"density_unit must be one of veh/km, .*got 'cars'"),
         ({"cell": 0.0}, {}, 100, r"cell must be"),
         ({}, {}, 450, r"duration must be below the field's 450 s, got 450"),
-        ({}, {"segments": 9}, 100, r"segments must be at most 8, got 9"),
+        ({}, {"segments": 9}, 100, r"segments must be at most 8, on 10 cells of 0\.05 km"),
         (
             {},
             {"lanes": 1},

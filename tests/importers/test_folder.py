@@ -2,11 +2,12 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from dptse_env.importers import Layout, Part, Source
 from dptse_env.importers.folder import assign_seeds
-from tests.importers.data import PLAIN, SPLITS, plain, run, stream
+from tests.importers.data import PLAIN, ROAD, SPLITS, plain, run, stream
 
 
 def test_several_files_are_several_recordings(tmp_path):
@@ -61,3 +62,16 @@ def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_a_mainline_that_nobody_drives_on_is_told(tmp_path):
+    points = stream(length=250.0)
+    lanes = Layout(mainline=Part(lanes=(1,)), on_ramps=(Part(lanes=(7,)),))
+    source = Source("table", {**PLAIN.columns, "lane": "lane"}, layout=lanes)
+    with pytest.warns(UserWarning, match=r"on the mainline's segments 4 of 4: are layout\.origin"):
+        run(plain(tmp_path / "a.csv", points, lane=np.ones(len(points), dtype=int)), source, ROAD)
+    (tmp_path / "imported").rename(tmp_path / "first")
+    path = plain(tmp_path / "b.csv", points, lane=np.full(len(points), 7))
+    with pytest.raises(ValueError, match="files must be with vehicles on the mainline"):
+        run(path, source, dataclasses.replace(ROAD, on_ramps=(3,), off_ramps=(), exit_shares=()))
+    assert {each.name for each in tmp_path.iterdir()} == {"a.csv", "first", "b.csv"}

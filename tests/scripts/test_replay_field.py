@@ -43,4 +43,9 @@ def test_what_does_not_suit_a_field_is_refused(tmp_path):
     assert "privacy.preset must be" in refused(*words, "--preset", "paced")
     assert "settings must be" in refused(*words, "--settings", "{1")
     assert "bandwidth must be" in refused(*words, "--bandwidth", "5")
+    # 50 m: too short for the EKF with these parameters, and what may be done is said.
+    short = [*words[: words.index("--segments")], "--segments", "6", *words[-4:]]
+    line = refused(*short, "--parameters", "paper", "--estimators", "random_walk", "ekf")
+    assert "segments must be fewer, got 6: corridor.segment_length must be at least 0.0567" in line
+    assert "random_walk" in line.partition(" an estimator that does not step the model: ")[2]
     assert "parameters must be" in refused(*words, "--parameters", "mine")

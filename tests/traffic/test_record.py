@@ -130,7 +130,7 @@ def test_average_dwell_by_hand():
     assert average_dwell(road, [record, record]) == pytest.approx((2 + 1 + 4 + 1) / 4)
     field = Record(field=np.full((5, 12, 2), [20.0, 36.0]), n_steps=5, n_columns=12)
     assert average_dwell(road, [field]) == pytest.approx(10.0)  # 100 m at 10 m/s
-    with pytest.raises(ValueError, match="records with a vehicle on the mainline"):
+    with pytest.raises(ValueError, match=r"corridor\.demand must be one that brings vehicles"):
         average_dwell(road, [])
 
 

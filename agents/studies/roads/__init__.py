@@ -25,7 +25,7 @@ from agents.figures import LABELS, draw_errors, save_measured
 from agents.play import Cell
 from agents.statistics import Interval
 from agents.studies.roads.own import KEPT_BACK, OWN_ROADS
-from agents.studies.roads.recorded import IDM_SEEDS
+from agents.studies.roads.recorded import IDM_SEEDS, QUEUES
 from agents.study import Study
 from agents.tables import (
     DENSITY,
@@ -60,6 +60,9 @@ RELEASES: dict[str, dict[str, Any]] = {
 """Keywords of the release models, which are those of the environments that come with them."""
 
 
+_Part = tuple[dict[str, Any], tuple[int, ...]]
+
+
 class Road(NamedTuple):
     """A road with its traffic.
 
@@ -70,14 +73,25 @@ class Road(NamedTuple):
     """
 
     env: str
-    parts: Sequence[tuple[dict[str, Any], tuple[int, ...]]]
+    parts: Sequence[_Part]
     releases: Sequence[str] = (PACED, CORRECTED)
 
 
+def _recorded(road: str, seeds: tuple[int, ...], bandwidth: int) -> _Part:
+    """Return a part of the road that `agents.studies.roads.recorded` has by a name."""
+    corridor = f"agents.studies.roads.recorded:{road}"
+    return {"corridor": corridor, "bandwidth": bandwidth, "traffic_seeds": seeds}, seeds
+
+
 _CALIBRATED = {"parameters": "w99-3lane"}
-_IDM = {"corridor": "agents.studies.roads.recorded:idm", "bandwidth": 2}
 OTHERS: dict[str, Road] = {
-    "another simulator": Road(PRIVATE, [({**_IDM, "traffic_seeds": IDM_SEEDS}, IDM_SEEDS)]),
+    **{
+        f"sections, {queue}": Road(
+            PRIVATE, [_recorded(f"section_{each}", (each,), bandwidth=3) for each in numbers]
+        )
+        for queue, numbers in QUEUES.items()
+    },
+    "another simulator": Road(PRIVATE, [_recorded("idm", IDM_SEEDS, bandwidth=2)]),
     "PrivateHighway-v1": Road(PRIVATE, [({}, MORE_SEEDS)]),
     "PaperHighway-v0": Road(PAPER, [(_CALIBRATED, MORE_SEEDS)], ("paper", CORRECTED)),
     "LongHighway-v0": Road(LONG, [({}, SEEDS)], (PACED,)),

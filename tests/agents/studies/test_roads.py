@@ -10,7 +10,8 @@ from agents.studies.roads import idm, on_road, recorded
 from agents.study import read_rows
 from agents.tables import pick
 from dptse_env.estimators import recurrent
-from dptse_env.traffic import CORRIDORS
+from dptse_env.traffic import CORRIDORS, Record
+from dptse_env.traffic.imported import load_record
 
 RECORDED = Path(__file__).parents[3] / "results" / "roads"
 NETWORKS = Path(recurrent.__file__).parent / "networks"
@@ -123,6 +124,34 @@ def test_nobody_drives_through_a_leader_that_stands():
         assert (np.diff(cars[0]) > idm.VEHICLE - 1e-9).all()
     assert cars[1].max() < 5.0
     assert np.diff(cars[0]).max() < 15.0
+
+
+def test_a_queue_through_the_end_is_told_from_one_inside():
+    road = idm.road()
+    speeds = np.full((40, idm.N + 2), 90.0)
+
+    def queue(*columns):
+        slow = speeds.copy()
+        slow[:10, columns] = 20.0
+        return recorded.queue_of(road, field(np.full_like(slow, 30.0), slow))
+
+    def field(*both):
+        n_steps, n_columns = speeds.shape
+        return Record(n_steps=n_steps, n_columns=n_columns, field=np.stack(both, axis=-1))
+
+    end = idm.N + 1
+    assert queue(idm.N - 1, end) == "queue through the end"
+    assert queue(4, 5) == "queue inside"
+    assert queue() == "no queue"
+    assert queue(end) is queue(4, end) is None  # not on the section's last segment
+
+
+@pytest.mark.slow
+def test_sections_are_as_they_are_called():
+    for queue, numbers in recorded.QUEUES.items():
+        road = CORRIDORS.find(f"agents.studies.roads.recorded:section_{numbers[1]}")()
+        record = load_record(road.recordings, numbers[1], road.record_layout)
+        assert recorded.queue_of(road, record) == queue
 
 
 @pytest.mark.usefixtures("short")
