@@ -112,9 +112,11 @@ class Mixture(BatchEstimator):
             slip = speed - measured.centre
             second = density * slip
             variance = (density * speed_std) ** 2 + (slip * density_std) ** 2
-        rows = self.model.rows.weights.T
-        means = np.stack([density @ rows, second @ rows], axis=-1)
-        variances = np.stack([density_std**2 @ rows**2, variance @ rows**2], axis=-1)
+        # einsum, whose bits do not depend on the batch as those of a product of matrices do.
+        means = self.model.rows.averages(np.stack([density, second], axis=-1))
+        variances = np.einsum(
+            "ms,nsk->nmk", self.model.rows.weights**2, np.stack([density_std**2, variance], axis=-1)
+        )
         return measured.values - means, np.maximum(variances + measured.sigma**2, LEAST_VARIANCE)
 
     def _estimate(self) -> Estimate:
