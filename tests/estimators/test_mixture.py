@@ -56,13 +56,15 @@ def test_experts_are_weighed_by_what_they_foretell(release):
 
 def test_an_expert_that_is_wrong_loses_its_weight_and_gets_it_back():
     """A walk follows what is released, and the model alone does not."""
-    episodes = simulate("w99-3lane", n_steps=180)
+    episodes = simulate("w99-3lane", n_steps=190)
     wrong = replace(episodes, values=episodes.values + np.array([80.0, 0.0]))
     settings = mixing("random_walk", "open_loop", memory=10.0)
     mixture = started("mixture", "compiled", episodes, settings)
     for given, steps, weight in (
-        (episodes, range(90), 1.0), (wrong, range(90, 120), 0.0), (episodes, range(120, 180), 1.0),
-    ):  # fmt: skip
+        (episodes, range(120), 1.0),
+        (wrong, range(120, 140), 0.0),
+        (episodes, range(140, 190), 1.0),
+    ):
         run(mixture, given, steps)
         np.testing.assert_allclose(mixture.weights[:, 0], [1.0 - weight, weight], atol=0.01)
 
