@@ -14,6 +14,8 @@ EVALUATION = range(1_000_000)
 """``dptse evaluate``, and the studies of estimators, of privacy and of ledgers."""
 TUNING = range(1_000_000, 2_000_000)
 """The search of estimator settings."""
+CHOICE = range(2_000_000, 3_000_000)
+"""The choice of parameters, estimator and query rule for a road, on validation traffic."""
 TRAINING_VALIDATION = range(4_000_000, 5_000_000)
 """The learning curve of a training, by which its best policy is kept."""
 STUDY_VALIDATION = range(5_000_000, 6_000_000)

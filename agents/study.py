@@ -88,15 +88,24 @@ def run(study: Study, place: Place, progress: bool = True) -> None:
         ExecutorError: Workers died again and again.
         OSError: The folder cannot be written to.
     """
-    place.folder.mkdir(parents=True, exist_ok=True)
-    _play_missing(study, study.cells, place, progress)
+    rows = play_study(study, place, progress)
     if study.follow is not None:
-        rows = read_rows(study.name, place.folder)
         _play_missing(study, study.follow(rows, place.folder), place, progress)
     for name, measure in study.measures.items():
         if not (place.folder / name).exists():
             write_table(place.folder / name, measure(place))
     write_report(study, place.folder)
+
+
+def play_study(study: Study, place: Place, progress: bool = True) -> pl.DataFrame:
+    """Play the cells of a study that the rows in a folder lack, and return all of its rows.
+
+    Raises:
+        ValueError, RecordingError, ExecutorError, OSError: See `run`.
+    """
+    place.folder.mkdir(parents=True, exist_ok=True)
+    _play_missing(study, study.cells, place, progress)
+    return read_rows(study.name, place.folder)
 
 
 def write_report(study: Study, folder: Path) -> None:
@@ -143,7 +152,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
         missing,
         lambda task, rows: write_table(_file_of(folder, task[0].id), rows),
         size=lambda task: len(task[1]),
-        progress=progress,
+        progress=progress and bool(missing),
         desc=study.name,
         unit="episode",
         mininterval=0.5,

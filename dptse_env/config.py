@@ -483,7 +483,7 @@ def _inherited(
         if isinstance(config.parameters, str) and "parameters" not in given:
             found.append("parameters")
     parameters = config.arz_parameters
-    is_other = is_other_road or tuned_with(parameters) != parameters.name
+    is_other = is_other_road or parameters != load_parameters(tuned_with(parameters))
     if is_other and config.settings_name is not None and "estimator_settings" not in given:
         found.append("estimator_settings")
     inherits = getattr(ESTIMATORS.find(config.estimator), "inherits", None)

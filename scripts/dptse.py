@@ -21,7 +21,7 @@ GROUPS = {
     "bring your own": {
         "import": "Import recorded trajectories, a SUMO network or a measured field as a road.",
         "record": "Record traffic with SUMO, so that environments only replay it.",
-        "calibrate": "Fit the parameters of the traffic model to recorded traffic.",
+        "fit": "Fit parameters, estimator and query rule to a road.",
         "tune": "Tune the estimators' settings on training traffic.",
     },
     "judge": {

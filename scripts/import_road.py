@@ -140,7 +140,12 @@ class Field:
         print_seeds(seeds)
         print(f"road: {self.output / ROAD}, segments of {corridor.segment_lengths[0]:g} km")
         print_next(
-            self.output / ROAD, seeds, corridor, PAPER, {"privacy": "corrected"}, fit_for=PAPER
+            self.output / ROAD,
+            seeds,
+            corridor,
+            PAPER,
+            {"privacy": "corrected"},
+            fit_for=f'{PAPER} {{"privacy": "corrected"}}',
         )
 
 
@@ -219,6 +224,7 @@ class Network:
             write_corridor(temporary, road.corridor, comment=describe(road))
         print(describe(road))
         print(f"written: {self.output}")
+        print(f"next: {shlex.join(('dptse', 'fit', self.output.as_posix()))}")
 
     def _files(self) -> Files:
         if self.configuration is not None:
@@ -271,7 +277,7 @@ def print_next(
         corridor: The road.
         env: Id of an environment.
         keywords: Its keywords.
-        fit_for: Id to fit the road for, if not the one that a fit has by default.
+        fit_for: Environment to fit the road for, if not the one that a fit has by default.
     """
     missing = [name for name, own in seeds.items() if not own]
     if missing:

@@ -134,6 +134,13 @@ def test_parameters_of_ones_own_keep_the_settings_of_those_they_come_from(source
     assert env.reset(seed=0)[1]["inherited"] == ["estimator_settings"]
 
 
+def test_a_set_of_ones_own_with_the_name_of_a_shipped_one_is_no_shipped_one():
+    mine = {**MINE, "name": "w99-3lane"}
+    with pytest.warns(UserWarning, match="^estimator_settings: .*or with other parameters"):
+        env = gym.make(ID, parameters=mine, traffic_seeds=[0])
+    assert env.unwrapped.config.inherited == ("estimator_settings",)
+
+
 @pytest.mark.filterwarnings("error")
 def test_parameters_of_ones_own_warn_of_nothing_where_settings_are_given_or_none_ship():
     given = gym.make(ID, parameters=MINE, estimator_settings={"count_noise": 0.5})

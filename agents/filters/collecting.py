@@ -31,7 +31,7 @@ from dptse_env.traffic import Corridor, Records, open_library
 from dptse_env.utils.arrays import AnyArray, FloatArray
 from dptse_env.vector_env import SensorQueryVectorEnv
 
-EACH = 4
+EACH = 1
 """Episodes of one scenario in a batch."""
 
 

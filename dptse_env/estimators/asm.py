@@ -40,7 +40,9 @@ memory that fades:
 
     k = (K + sum M (e^2 - noise) / (noise + M)^2) / (K + sum M^2 / (noise + M)^2)
 
-held to 1 to 10: they stay at 1 where noise hides what is smoothed away.
+held to 1 to 10: they stay at 1 where noise hides what is smoothed away. Where the last release
+within reach is of A seconds ago the variances c_1 lanes^2 and c_2 are added, times
+(A / (A + `STALE`))^2: inputs alone say little of a ramp with a queue.
 """
 
 from __future__ import annotations
@@ -71,6 +73,9 @@ WEIGHT, DENSITY, SPEED, DENSITY_NOISE, SPEED_NOISE = range(5)
 DENSITY_MODEL = 0.8, 0.5
 SPEED_MODEL = 310.0, 0.4
 """Coefficients a [veh^(3/2), 1] and b [(km/h)^2, 1] of the variance that is smoothed away."""
+STALE_VARIANCE = 30.0**2, 40.0**2
+"""Coefficients c [(veh/km)^2, (km/h)^2]: variances of traffic that nothing is known of."""
+STALE = 60.0
 MEMORY, CONFIDENCE = 300.0, 0.3
 """Seconds in which the factors forget, and K: how many innovations without noise k = 1 is worth."""
 LARGEST_FACTOR = 10.0
@@ -96,6 +101,7 @@ class Stencil(NamedTuple):
     threshold: float  # V
     transition: float  # dV
     largest_speed: float
+    step: float  # [s]
     forgetting: float  # of the factors in a step
 
 
@@ -124,6 +130,7 @@ class State(NamedTuple):
     sums: FloatArray  # (n, S, 2, 5) of both waves
     present: FloatArray  # (n, S, 4) density, speed and their deviations
     smoothed: FloatArray  # (n, S, 2) variances of what is smoothed away, without their factors
+    age: FloatArray  # (n, S) seconds since the last release within reach
     evidence: FloatArray  # (n, S, 2, 2) sums of the factors' numerators and denominators
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
@@ -154,6 +161,7 @@ class AdaptiveSmoothing(BatchEstimator):
             sums=np.zeros((n, S, 2, 5)),
             present=np.zeros((n, S, 4)),
             smoothed=np.zeros((n, S, 2)),
+            age=np.zeros((n, S)),
             evidence=np.zeros((n, S, 2, 2)),
             innovations=self.innovations,
             diverged=self.diverged,
@@ -232,6 +240,7 @@ def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stenci
         threshold=float(settings.threshold),
         transition=float(settings.transition),
         largest_speed=float(model.largest_speed),
+        step=float(step),
         forgetting=math.exp(-step / MEMORY),
     )
 
@@ -306,6 +315,7 @@ def restart(bundle: Bundle, episodes: IntArray, prior: FloatArray) -> None:
         past[:] = 0.0
         state.place[e] = 0
         state.evidence[e] = CONFIDENCE
+        state.age[e] = 0.0
         state.innovations[e] = 0.0
         for s in range(stencil.lanes.size):
             lanes, known = stencil.lanes[s], past[s, 0]
@@ -339,6 +349,7 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
         if ends.weight > 0.0:
             _read_ends(ends, inputs[k], present, past, place, stencil.lanes)
         for s in range(stencil.lanes.size):
+            state.age[e, s] += stencil.step
             for i in range(2):
                 for j in range(2):
                     # Evidence fades towards none, which is the factor 1.
@@ -447,13 +458,15 @@ def _evaluate(stencil: Stencil, state: State, e: int) -> None:
         smoothed[s, 0] = flicker + DENSITY_MODEL[1] * gap**2
         flicker = SPEED_MODEL[0] / (1.0 + vehicles)
         smoothed[s, 1] = flicker + SPEED_MODEL[1] * (v_jam - v_free) ** 2
+        share = (state.age[e, s] / (state.age[e, s] + STALE)) ** 2
         for i in range(2):
             noise = by_free * math.sqrt(max(free[DENSITY_NOISE + i], 0.0))
             noise += by_jam * math.sqrt(max(jam[DENSITY_NOISE + i], 0.0))
             if i == 0:
                 noise *= lanes
+            unknown = share * STALE_VARIANCE[i] * (lanes**2 if i == 0 else 1.0)
             factor = _factor(state.evidence[e, s, i])
-            present[s, 2 + i] = math.sqrt(noise**2 + factor * smoothed[s, i])
+            present[s, 2 + i] = math.sqrt(noise**2 + factor * smoothed[s, i] + unknown)
 
 
 @kernel_part
@@ -563,3 +576,4 @@ def _add(stencil: Stencil, state: State, e: int, s: int, value: FloatArray) -> N
             out[c] += f[0, 0] * value[c]
         for c in range(DENSITY_NOISE, 5):
             out[c] += f[1, 0] * value[c]
+        state.age[e, stencil.target[q]] = 0.0

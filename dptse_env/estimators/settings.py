@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from dptse_env.model import ARZParameters, Bounds, available_parameters
+from dptse_env.model import ARZParameters, Bounds, available_parameters, load_parameters
 from dptse_env.utils.fields import (
     Interval,
     check_object,
@@ -296,7 +296,7 @@ def tuned_settings(
 
 def tuned_with(parameters: ARZParameters) -> str:
     """Return the name of the shipped ARZ parameters whose tuned settings hold for these."""
-    if parameters.name in available_parameters():
+    if parameters in map(load_parameters, available_parameters()):
         return parameters.name
     return parameters.derived_from or DEFAULT_PARAMETERS
 

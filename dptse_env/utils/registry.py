@@ -198,8 +198,8 @@ def load_plugins() -> None:
 
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "train": (
-        "optuna", "plotly", "polars", "rich", "sb3_contrib", "stable_baselines3", "torch",
-        "tyro",
+        "optuna", "plotly", "polars", "rich", "sb3_contrib", "stable_baselines3", "tomlkit",
+        "torch", "tyro",
     ),
     "corridors": ("polars", "sumo"),
     "ray": ("ray",),

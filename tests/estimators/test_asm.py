@@ -14,6 +14,8 @@ from dptse_env.estimators.asm import (
     MEMORY,
     REACH,
     SPEED_MODEL,
+    STALE,
+    STALE_VARIANCE,
     entry_density,
 )
 from dptse_env.model import ARZModel, load_parameters
@@ -61,6 +63,7 @@ class Textbook:
         ]
         self.evidence = np.full((model.n_segments, 2, 2), CONFIDENCE)
         self.smoothed = np.zeros((model.n_segments, 2))
+        self.last = np.zeros(model.n_segments)
 
     def factors(self):
         ratio = self.evidence[..., 0] / self.evidence[..., 1]
@@ -96,6 +99,8 @@ class Textbook:
                 SPEED_MODEL[0] / (1.0 + n) + SPEED_MODEL[1] * between[1] ** 2,
             )
             variances = (carried * [lanes[s], 1.0]) ** 2 + self.factors()[s] * self.smoothed[s]
+            age = (self.t - self.last[s]) * model.time_step
+            variances += (age / (age + STALE)) ** 2 * np.array(STALE_VARIANCE) * [lanes[s] ** 2, 1]
             speed = np.clip(speed, 0.0, model.largest_speed)
             self.now[s] = density, speed, *np.sqrt(variances)
 
@@ -160,6 +165,9 @@ class Textbook:
                 # As many values as segments, of the row's variance times their number.
                 variance = noise * len(covered) * H[s] ** 2
                 self.values.append((self.chain[s], self.x[s], self.t, H[s], z, variance))
+                gap = np.abs(self.x - self.x[s])
+                reached = (self.chain == self.chain[s]) & (gap <= REACH * self.settings.length)
+                self.last[reached] = self.t
                 for i in range(2):
                     ratio = evidence[s, i, 0] / evidence[s, i, 1]
                     rest = variances[i] - np.clip(ratio, 1.0, LARGEST_FACTOR) * smoothed[i]

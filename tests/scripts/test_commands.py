@@ -270,7 +270,6 @@ def test_a_file_that_cannot_be_read_is_named(kind, how, tmp_path, monkeypatch):
 
 REPLACED = {
     "evaluate": ["--env", SHORT, "rows.parquet"],
-    "calibrate": ["fitted.json"],
     "audit": ["paced-worst-case-hunter.json"],
     "import network": ["--path", "a b", "road.toml"],
 }

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dptse_env.traffic import Demand, RecordLibrary, read_corridor
+from tests.agents.test_measured_field import source
 from tests.helpers import make_env
 from tests.importers.data import STRAIGHT, driven, plain, stream, write_csv
 from tests.importers.network.conftest import PATH, motorway
@@ -161,6 +162,24 @@ def test_the_page_on_own_data_goes_on_to_a_policy(fifteen_minutes, monkeypatch):
     assert "1 episode on test traffic" in done.stdout
 
 
+@pytest.mark.parametrize("duration", [90, 200])
+def test_a_field_says_what_comes_next_or_what_is_missing_for_it(duration, tmp_path):
+    field = source(tmp_path, columns=60)
+    printed = run(
+        "field", "--density", field.density, "--speed", field.speed, "--cell", "0.05",
+        "--interval", "5", "--density-unit", "veh/ft", "--speed-unit", "ft/s", "--name", "mine",
+        "--segments", "3", "--lanes", "5", "--speed-limit", "50", "--duration", duration,
+        "--output", tmp_path / "new",
+    )  # fmt: skip
+    road = (tmp_path / "new" / "road.toml").as_posix()
+    if duration == 200:
+        assert "note: there is no window for validation and test" in printed
+        return
+    fit, evaluate = re.findall(r"^next: dptse (.*)$", printed, re.MULTILINE)
+    assert shlex.split(fit) == ["fit", road, "--env", f'{PAPER} {{"privacy": "corrected"}}']
+    assert shlex.split(evaluate)[-1] == "2000:2001"
+
+
 @pytest.fixture(scope="module")
 def town(tmp_path_factory):
     folder = tmp_path_factory.mktemp("own")
@@ -178,6 +197,7 @@ def test_a_network_becomes_a_road_of_any_environment(town):
     printed = run(*words, named, "--configuration", town / "own.sumocfg", "--path", "in ... out")
     assert "on-ramp at face 3: ramp-b" in printed
     assert "off-ramp at face 15: exit-a" in printed
+    assert f"next: dptse fit {shlex.quote(named.as_posix())}\n" in printed
     files = "--net", town / "road.net.xml", "--routes", town / "road.rou.xml"
     run(*words, given, *files, "--path", " ".join(PATH), "--step-length", "0.5")
     assert read_corridor(given).digest == read_corridor(named).digest

@@ -48,7 +48,7 @@ OPENED = False
 PRIVATE, PAPER = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/PaperHighway-v0"
 LONG = "dptse_env:dptse/LongHighway-v0"
 SEEDS, MORE_SEEDS = tuple(range(2000, 2008)), tuple(range(2000, 2016))
-FILTERS, NETWORK = ("ekf", "blend"), "recurrent"
+FILTERS, NETWORK = ("ekf", "blend", "asm"), "recurrent"
 SHIPPED = "highway"
 """The network of the package."""
 PACED, CORRECTED = "paced", "corrected"

@@ -91,6 +91,15 @@ def test_faults_are_those_of_one_detector():
     assert corridor_of(queries).fixed_sensors == ()
 
 
+def test_networks_of_other_seeds_are_played_in_every_world_beside_that_of_the_package():
+    added = study.study(["one", "two"]).cells[len(STUDY.cells) :]
+    assert {(cell.labels["world"], cell.labels["network"]) for cell in added} == {
+        (world, number) for world in study.WORLDS for number in (1, 2)
+    }
+    weights = {cell.keywords["estimator_settings"]["recurrent"]["weights"] for cell in added}
+    assert weights == {"one", "two"}
+
+
 @pytest.mark.slow
 def test_it_plays_and_reports(tmp_path):
     found = (study.world_cell("ShortHighway-v0", name) for name in study.MOVED[:2])

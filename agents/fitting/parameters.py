@@ -1,0 +1,229 @@
+"""ARZ parameters by the errors of the filter that has them, on training traffic.
+
+Errors of a model's predictions do not tell what serves a filter: with a higher v_f and a lower
+gamma predictions go on improving, to whatever bound the search has, while the filter gets worse. So
+the search plays whole episodes and minimises the error that the environment reports. It begins at
+a shipped set, and the filter has the tuned settings of that set, which the fitted one inherits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import optimize
+from tqdm import tqdm
+
+from agents.files import write_json
+from agents.play import Cell, play
+from dptse_env.config import TIME_STEP
+from dptse_env.model import ARZModel, ARZParameters
+from dptse_env.release import Traffic
+from dptse_env.traffic import Corridor, RecordLibrary
+from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.fields import read_json
+
+FIELDS = ("free_flow_speed", "jam_density", "gamma", "relaxation_time")
+"""Parameters that are searched, the jam density for one lane."""
+
+_WIDTH = 0.2  # first steps of the search, as shares of the values
+_REFUSED = 1e4  # error x 1000 of parameters that violate the CFL condition
+
+MEANING = {
+    ("free_flow_speed", "least"): "traffic is far slower than its limit: check speed_limit",
+    ("free_flow_speed", "largest"): (
+        "v_f and gamma make up for each other here: v_f is a shape, not a speed that is driven"
+    ),
+    ("free_flow_speed", "cfl"): (
+        "the shortest segments and steps of 1 s allow no higher one; longer segments would"
+    ),
+    ("jam_density", "least"): (
+        "the filter would take a road that is full at less, but traffic as dense was recorded"
+    ),
+    ("jam_density", "largest"): "no jam was recorded that would tell how dense one is",
+    ("gamma", "least"): (
+        "speeds fall with the logarithm of density: v_f and the jam density make up for each other"
+    ),
+    ("gamma", "largest"): "speeds hardly depend on density: there was no queue to learn from",
+    ("relaxation_time", "least"): "drivers follow the density at once",
+    ("relaxation_time", "largest"): "speeds keep what they had at the entry: none relaxes",
+}
+"""What it means that a parameter ended at a bound."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Outcome of a search.
+
+    Attributes:
+        parameters: The fitted set.
+        start: Error x 1000 of the filter on training traffic at the start of the search.
+        error: The same with the fitted set.
+        at_bounds: Parameters that ended at a bound, and what that means, a sentence each.
+    """
+
+    parameters: ARZParameters
+    start: float
+    error: float
+    at_bounds: tuple[str, ...]
+
+
+def traffic_of(
+    corridor: Corridor, seeds: Sequence[int], library: RecordLibrary
+) -> tuple[FloatArray, FloatArray]:
+    """Return densities for a lane [veh/km] and speeds [km/h] of all segments, shape (n, S)."""
+    traffic, s = Traffic(corridor, tuple(seeds), library), corridor.n_segments
+    traffic.load(range(len(seeds)))
+    tables = np.concatenate([traffic.complete(index)[:, :s] for index in range(len(seeds))])
+    return tables[..., 0] / np.array(corridor.segment_lanes), tables[..., 1]
+
+
+def start_from(shipped: ARZParameters, corridor: Corridor, name: str) -> ARZParameters:
+    """Return a shipped set for the lanes of a road, slowed down until its CFL condition holds."""
+    lanes = max(corridor.segment_lanes[: corridor.n_mainline])
+    start = dataclasses.replace(
+        shipped,
+        name=name,
+        jam_density=shipped.jam_density / shipped.lanes * lanes,
+        lanes=lanes,
+        derived_from=shipped.name,
+    )
+    while not is_stable(start, corridor):
+        slower, flatter = 0.97 * start.free_flow_speed, 0.97 * start.gamma
+        start = dataclasses.replace(start, free_flow_speed=slower, gamma=flatter)
+    return start
+
+
+def is_stable(parameters: ARZParameters, corridor: Corridor) -> bool:
+    """Return whether the CFL condition of a set holds on a road."""
+    try:
+        ARZModel(corridor, parameters).require_time_step()
+    except ValueError:
+        return False
+    return True
+
+
+def fit_parameters(
+    corridor: Corridor,
+    cell: Cell,
+    seeds: Sequence[int],
+    start: ARZParameters,
+    densest: float,
+    library: RecordLibrary,
+    tries: int,
+    kept: Path,
+) -> Fit:
+    """Search the parameters with which a filter errs least, by Nelder and Mead's method.
+
+    The search is deterministic, and reads what it has tried from a file: it goes on where it was
+    interrupted.
+
+    Args:
+        corridor: The road.
+        cell: The filter and the query rule, without parameters.
+        seeds: Training traffic.
+        start: Where the search begins.
+        densest: Largest density for a lane in training traffic [veh/km]; no jam is less dense.
+        library: Source of the records.
+        tries: Sets to try at most.
+        kept: JSON file of what was tried.
+    """
+    limit = corridor.largest_speed_limit
+    low = np.log([0.8 * limit, max(densest, 40.0), 0.1, 5.0])
+    high = np.log([2.5 * limit, max(2.0 * densest, 300.0), 5.0, 500.0])
+    tried: dict[tuple[float, ...], float] = {}
+    if kept.exists():
+        tried = {tuple(values): error for *values, error in read_json(kept)}
+    shown = tqdm(total=tries, desc="ARZ parameters", unit="try", mininterval=0.5)
+
+    def parameters_at(values: FloatArray) -> ARZParameters:
+        v_f, jam, gamma, tau = _rounded(np.clip(values, low, high))
+        return dataclasses.replace(
+            start,
+            free_flow_speed=v_f,
+            jam_density=round(jam * start.lanes, 2),
+            gamma=gamma,
+            relaxation_time=tau,
+        )
+
+    def error_at(values: FloatArray) -> float:
+        parameters = parameters_at(values)
+        key = tuple(float(getattr(parameters, name)) for name in FIELDS)
+        if key not in tried:
+            tried[key] = _REFUSED
+            if is_stable(parameters, corridor):
+                tried[key] = filter_error(cell, parameters, seeds, library)
+            write_json(kept, [[*each, error] for each, error in tried.items()])
+        shown.update()
+        shown.set_postfix_str(f"error {min(tried.values()):.1f}")
+        return tried[key]
+
+    per_lane = start.jam_density / start.lanes
+    first = np.log([start.free_flow_speed, per_lane, start.gamma, start.relaxation_time])
+    first = np.clip(first, low, high)
+    # Away from the nearer bound, so that no first step is cut to nothing.
+    steps = np.where(first + _WIDTH <= high, _WIDTH, -_WIDTH)
+    with shown:
+        found = optimize.minimize(
+            error_at,
+            first,
+            method="Nelder-Mead",
+            bounds=list(zip(low, high, strict=True)),
+            options={
+                "maxfev": tries,
+                "xatol": 5e-3,
+                "fatol": 5e-3,
+                "initial_simplex": np.vstack([first, first + np.diag(steps)]),
+            },
+        )
+    parameters = parameters_at(found.x)
+    return Fit(
+        parameters,
+        start=error_at(first),
+        error=float(found.fun),
+        at_bounds=tuple(_at_bounds(found.x, low, high, parameters, corridor)),
+    )
+
+
+def filter_error(
+    cell: Cell, parameters: ARZParameters, seeds: Sequence[int], library: RecordLibrary
+) -> float:
+    """Return the mean error x 1000 of a filter with given parameters.
+
+    All episodes are one batch: the steps of a batch take little longer than those of an episode.
+    """
+    keywords = {**cell.keywords, "parameters": dataclasses.asdict(parameters)}
+    rows = play(dataclasses.replace(cell, keywords=keywords, watchers=()), seeds, library)
+    return float(np.mean([-1000.0 * row["reward"] for row in rows]))
+
+
+def _rounded(values: FloatArray) -> list[float]:
+    """Return values given by their logarithms, to four digits."""
+    return [float(f"{value:.4g}") for value in np.exp(values)]
+
+
+def _at_bounds(
+    values: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    parameters: ARZParameters,
+    corridor: Corridor,
+) -> list[str]:
+    """Say which parameters ended at a bound of the search, and what that means."""
+    found = []
+    for name, value, least, largest in zip(FIELDS, values, low, high, strict=True):
+        end = "least" if value - least < 0.01 else "largest" if largest - value < 0.01 else None
+        if end is not None:
+            number = getattr(parameters, name)
+            found.append(f"{name} ended at {number:g}, the {end} tried: {MEANING[name, end]}")
+    shortest = min(corridor.segment_lengths)
+    if parameters.largest_time_step(shortest) < 1.02 * TIME_STEP:
+        number = parameters.free_flow_speed
+        found.append(
+            f"free_flow_speed ended at {number:g}, the CFL condition's largest on {shortest:g} km: "
+            f"{MEANING['free_flow_speed', 'cfl']}"
+        )
+    return found

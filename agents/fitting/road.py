@@ -1,0 +1,245 @@
+"""A road that is fitted: its file, the environment that it is fitted for, and its traffic seeds."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from agents.environments import parse_env, quietly
+from agents.files import first_difference, write_json
+from agents.seeds import require_seeds
+from dptse_env.config import (
+    PRESETS,
+    TEST_SEEDS,
+    TRAINING_SEEDS,
+    VALIDATION_SEEDS,
+    EnvConfig,
+    parse_seeds,
+    resolve,
+)
+from dptse_env.evaluation import WARM_UP
+from dptse_env.model import available_parameters
+from dptse_env.model.parameters import LARGEST_W, SECONDS_PER_HOUR
+from dptse_env.release import RELEASE_MODELS
+from dptse_env.traffic import (
+    Corridor,
+    RecordLibrary,
+    average_dwell,
+    is_road_file,
+    ranges,
+    read_road,
+    write_corridor,
+)
+from dptse_env.traffic.imported import has_vehicles, recorded_seeds
+from dptse_env.utils.fields import read_json, require
+
+CHOSEN = ("parameters", "estimator", "estimator_settings")
+"""Keywords of an environment that a fit decides."""
+
+KINDS = {"training": TRAINING_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+"""Kinds of traffic, and the seeds that each may have."""
+
+BEGUN, PLAYED = "begun.json", "road.toml"
+"""What a fit was begun with, and the road that its episodes are played on."""
+
+
+@dataclass(frozen=True)
+class Road:
+    """A road and the environment that it is fitted for.
+
+    Attributes:
+        path: The road file.
+        corridor: The road.
+        env: Id of the environment.
+        config: The environment, as the file and the keywords make it before the fit.
+        keywords: Keywords of every episode that is played, without `CHOSEN`.
+        present: Keywords among `CHOSEN` that the file has, if they are neither shipped sets nor
+            those of an earlier fit.
+        assumed: Fields of the corridor that the file does not give.
+        seeds: Traffic seeds by kind, as `KINDS`.
+        decided: Keywords among these that neither the file nor the caller gives.
+        remarks: What was decided for want of a word in the file, a sentence each.
+    """
+
+    path: Path
+    corridor: Corridor
+    env: str
+    config: EnvConfig
+    keywords: Mapping[str, Any]
+    present: Mapping[str, Any]
+    assumed: tuple[str, ...]
+    seeds: Mapping[str, tuple[int, ...]]
+    decided: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def inherited(self) -> str:
+        """Name of the ARZ parameters that the environment has where nobody gives any."""
+        return str(PRESETS[_preset(self.env)].parameters)
+
+    @property
+    def all_seeds(self) -> tuple[int, ...]:
+        """Traffic seeds of all kinds."""
+        return tuple(seed for kind in KINDS for seed in self.seeds[kind])
+
+    def identity(self, tries: int) -> dict[str, Any]:
+        """Return what two fits must share for one to go on with what the other has found."""
+        road = dataclasses.asdict(self.corridor)
+        del road["average_dwell"]  # the fit itself puts it into the file
+        content = {
+            "road": road,
+            "env": self.env,
+            "keywords": self.keywords,
+            "seeds": self.seeds,
+            "tries": tries,
+            "dptse-env": version("dptse-env"),
+        }
+        found: dict[str, Any] = json.loads(json.dumps(content))
+        return found
+
+    def check(self, stages: Path, tries: int) -> None:
+        """Check that a folder has no fit, or one with the same identity.
+
+        Raises:
+            ValueError: It has the fit of another road, environment, seeds or version.
+        """
+        if (stages / BEGUN).exists():
+            kept = read_json(stages / BEGUN)
+            difference = first_difference(kept, self.identity(tries))
+            if difference is not None:
+                raise ValueError(
+                    f"{stages.parent} has the fit of something else: {difference}. Remove the "
+                    "folder, or choose another --output"
+                )
+
+    def begin(self, stages: Path, tries: int, dwell: float) -> None:
+        """Write down what is fitted, and the road that is played, with the dwell that it has."""
+        stages.mkdir(parents=True, exist_ok=True)
+        write_json(stages / BEGUN, self.identity(tries))
+        if "average_dwell" in self.assumed:
+            played = dataclasses.replace(self.corridor, average_dwell=dwell)
+        else:
+            played = self.corridor
+        write_corridor(stages / PLAYED, played)
+
+    def measure_dwell(self, library: RecordLibrary) -> float:
+        """Return the average dwell in training traffic [s].
+
+        Raises:
+            ValueError: No vehicle was ever on the mainline; the message has the file's path.
+        """
+        records = (library.get(self.corridor, seed) for seed in self.seeds["training"])
+        try:
+            return round(average_dwell(self.corridor, records), 2)
+        except ValueError as problem:
+            raise ValueError(
+                f"{self.path}: no vehicle is on the mainline in training traffic: give the road "
+                "demand, or recordings with vehicles"
+            ) from problem
+
+
+def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None]) -> Road:
+    """Read a road file and check everything that needs no traffic.
+
+    Args:
+        path: The road file.
+        env: Id of the environment, or id and keywords as JSON (`agents.environments.parse_env`).
+        folder: Where the fit goes; what the file has from there is no present choice.
+        seeds: Traffic seeds by kind, as `KINDS`, ``"first:stop"``; None for the usual number, or
+            all that were recorded.
+
+    Raises:
+        ValueError: The file, a keyword or a seed is out of range, or the road cannot be fitted; the
+            message starts with a path and says what to change.
+    """
+    require(is_road_file(path), "road", "a road file, whose name ends in .toml", str(path))
+    road = read_road(path)
+    corridor, (env, given) = road.corridor, parse_env(env)
+    for key in (*CHOSEN, "corridor", "traffic_seeds", "records"):
+        require(key not in given, f"env.{key}", "left out", given.get(key))
+    _check_road(path, corridor)
+    present = {key: value for key, value in road.environment.items() if key in CHOSEN}
+    own, known = str(folder.absolute()), available_parameters()
+    foreign = [present.get(key) for key in ("parameters", "estimator_settings")]
+    if all(each is None or str(each).startswith(own) or each in known for each in foreign):
+        present = {}
+    keywords = {k: v for k, v in road.environment.items() if k not in (*CHOSEN, "traffic_seeds")}
+    keywords |= given
+    base, decided, remarks = PRESETS[_preset(env)], list[str](), list[str]()
+    third = max(corridor.n_mainline // 3, 1)
+    if "bandwidth" not in keywords and third < base.bandwidth:
+        keywords["bandwidth"] = third
+        decided.append("bandwidth")
+        remarks.append(f"bandwidth {third}, a third of the segments")
+    is_field = corridor.recordings is not None and not has_vehicles(corridor.recordings)
+    needs_vehicles = RELEASE_MODELS.find(base.privacy.preset).needs_vehicles
+    if is_field and needs_vehicles and "privacy" not in keywords:
+        keywords["privacy"] = "corrected"
+        decided.append("privacy")
+        remarks.append("release model 'corrected', since a measured field has no vehicles")
+    found = _seeds_of(path, corridor, seeds)
+    with quietly():
+        more = {"corridor": str(path), "traffic_seeds": list(found["test"])}
+        config = resolve(_preset(env), {**keywords, **more})
+    longer = f"more than the {WARM_UP} s that do not count"
+    require(config.horizon_steps > WARM_UP, f"{path}: duration", longer, config.horizon_steps)
+    return Road(
+        path, corridor, env, config, keywords, present, road.assumed, found, tuple(decided),
+        tuple(remarks),
+    )  # fmt: skip
+
+
+def _preset(env: str) -> str:
+    return str(gym.spec(env.rpartition(":")[2]).kwargs["preset"])
+
+
+def _check_road(path: Path, corridor: Corridor) -> None:
+    """Refuse a road without traffic, and segments that no set of parameters could suit."""
+    if corridor.recordings is None and corridor.network is None:
+        rates = [rate for _, rate in corridor.published_demand.mainline]
+        require(max(rates) > 0.0, f"{path}: demand.mainline", "above 0 veh/h at some time", rates)
+    pairs = zip(corridor.segment_lengths, corridor.speed_limits, strict=True)
+    for segment, (length, limit) in enumerate(pairs):
+        least = LARGEST_W * limit / SECONDS_PER_HOUR
+        if length < 1.02 * least:
+            raise ValueError(
+                f"{path}: segment {segment} of {length:g} km must be longer than "
+                f"{1.02 * least:.3f} km at {limit:g} km/h, so that no vehicle crosses it within "
+                "the time step of 1 s; or choose the estimator asm, which steps no model"
+            )
+
+
+def _seeds_of(
+    path: Path, corridor: Corridor, given: Mapping[str, str | None]
+) -> dict[str, tuple[int, ...]]:
+    """Return the seeds of each kind: those given, all that were recorded, or the usual number."""
+    recorded = None if corridor.recordings is None else recorded_seeds(corridor.recordings)
+    found = {}
+    for kind, allowed in KINDS.items():
+        text = given[kind]
+        if text is not None:
+            found[kind] = parse_seeds(text, kind)
+        elif recorded is None:
+            n = USUAL[kind]
+            found[kind] = tuple(allowed[:n])
+        else:
+            found[kind] = tuple(seed for seed in recorded if seed in allowed)
+            if not found[kind]:
+                raise ValueError(
+                    f"{path}: recordings must have a window of {kind} traffic, got seeds "
+                    f"{ranges(recorded)}: import them again with a shorter duration, or other "
+                    "--shares"
+                )
+        require_seeds(kind, found[kind], allowed)
+    return found
+
+
+USUAL = {"training": 8, "validation": 8, "test": 16}
+"""Traffic seeds of each kind on a road that is simulated."""

@@ -1,0 +1,84 @@
+"""The result of a fit in the road file: its table ``environment``, with all else as it stands."""
+
+from __future__ import annotations
+
+import copy
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from agents.fitting.road import CHOSEN
+from dptse_env.utils.files import write_atomically
+
+TABLE, DWELL = "environment", "average_dwell"
+
+
+def copy_of(path: Path) -> Path:
+    """Return where the copy of a road file is kept."""
+    return path.with_name(f"{path.stem}.before-fit{path.suffix}")
+
+
+def from_home(path: Path, file: Path) -> str:
+    """Return the path of a file from the folder of a road file on, as its table has it."""
+    target, home = file.absolute(), path.absolute().parent
+    same_drive = target.drive == home.drive
+    return Path(os.path.relpath(target, home)).as_posix() if same_drive else target.as_posix()
+
+
+def write_choice(path: Path, keywords: Mapping[str, Any], dwell: float | None) -> bool:
+    """Put keywords into the table of a road file, and keep a copy of the file as it was.
+
+    Comments, order and all other values stay. Of the keywords that a fit decides, those that are
+    not given go.
+
+    Args:
+        path: The road file.
+        keywords: Keywords of an environment.
+        dwell: Average dwell [s] of a file that has none; None to leave it as it is.
+
+    Returns:
+        Whether the file is another one now.
+
+    Raises:
+        OSError: It cannot be written; it stays as it was.
+        ValueError: The table cannot be changed where it stands; the message has what to add.
+    """
+    text = path.read_bytes().decode("utf-8")
+    new = _changed(text, keywords, dwell)
+    expected = tomllib.loads(text)
+    table = {k: v for k, v in expected.get(TABLE, {}).items() if k not in CHOSEN}
+    expected[TABLE] = {**table, **keywords}
+    if dwell is not None:
+        expected[DWELL] = dwell
+    if tomllib.loads(new) != expected:
+        lines = ", ".join(f"{key} = {value!r}" for key, value in keywords.items())
+        raise ValueError(f"{path}: {TABLE} cannot be changed: write it as a table, with {lines}")
+    if new == text:
+        return False
+    write_atomically(copy_of(path), text)
+    write_atomically(path, new)
+    return True
+
+
+def _changed(text: str, keywords: Mapping[str, Any], dwell: float | None) -> str:
+    document = tomlkit.parse(text)
+    table: Any = document.setdefault(TABLE, tomlkit.table())
+    for key in CHOSEN:
+        if key not in keywords:
+            table.pop(key, None)
+    for key, value in keywords.items():
+        if table.get(key) != value:
+            table[key] = copy.copy(value)
+    new = tomlkit.dumps(document)
+    if dwell is None:
+        return new
+    # Ahead of the first entry is always the top level, which tables end.
+    lines = new.splitlines(keepends=True)
+    first = next(k for k, line in enumerate(lines) if line.strip() and line.lstrip()[0] != "#")
+    end = "\r\n" if lines[first].endswith("\r\n") else "\n"
+    measured = f"{DWELL} = {dwell:g}  # measured by dptse fit [s]{end}"
+    return "".join([*lines[:first], measured, *lines[first:]])

@@ -1,0 +1,323 @@
+"""A road is fitted: what is searched, what is chosen, and what its file says afterwards."""
+
+import json
+import subprocess
+import sys
+import time
+import tomllib
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("tomlkit")
+
+from agents.executors import THIS_PROCESS
+from agents.fitting import choice as choosing
+from agents.fitting import parameters as searching
+from agents.fitting.choice import Choice
+from agents.fitting.parameters import fit_parameters, start_from
+from agents.fitting.road import find_road
+from agents.fitting.road_file import copy_of, write_choice
+from agents.play import Cell
+from agents.study import Place
+from dptse_env.model import load_parameters
+from dptse_env.traffic import RecordLibrary, read_road
+from tests.scripts.commands import ROOT, refused, run_command
+
+ID = "dptse_env:dptse/PrivateHighway-v1"
+ROAD = """# my road
+n_mainline = 4     # segments
+lanes = 2
+segment_length = 0.1
+speed_limit = 90
+duration = 90
+
+# how many come
+[demand]
+mainline = [[0, 2400]]  # veh/h
+"""
+BRIEF = (
+    "--training", "0:2", "--validation", "1000:1002", "--test", "2000:2002", "--tries", "4",
+    "--estimators", "ekf", "random_walk", "--rules", "round-robin", "oldest-first",
+    "--workers", "1",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A road, fitted, and what the command printed."""
+    path = tmp_path_factory.mktemp("fit") / "my-road.toml"
+    path.write_text(ROAD)
+    done = run_command("fit", path, *BRIEF, "--json")
+    assert done.returncode == 0, done.stderr
+    return path, json.loads(done.stdout)
+
+
+def files_of(folder):
+    return {each: each.read_bytes() for each in sorted(folder.rglob("*")) if each.is_file()}
+
+
+def test_the_file_has_the_choice_and_keeps_all_else(fitted):
+    path, found = fitted
+    text = path.read_text()
+    assert copy_of(path).read_text() == ROAD
+    assert [line for line in ROAD.splitlines() if line not in text.splitlines()] == []
+    content = tomllib.loads(text)
+    assert content["environment"]["estimator"] == found["estimator"]
+    assert content["environment"]["bandwidth"] == 1
+    assert 3.0 < content["average_dwell"] < 10.0
+
+
+def test_the_environment_has_the_set_of_the_file_by_its_name(fitted):
+    path, found = fitted
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        env = gym.make(ID, corridor=str(path), traffic_seeds=[0], parameters=set_of(path))
+    config = env.unwrapped.config
+    assert (config.arz_parameters.name, config.bandwidth) == ("my-road", 1)
+    # Its settings are those of the set that it comes from, and that is said.
+    assert config.settings_name == f"{found['estimator']}-w99-3lane-paced"
+    assert list(config.inherited) == ["estimator_settings"]
+    assert any(str(each.message).startswith("estimator_settings:") for each in caught)
+    names = {each["parameters"] for each in found["test"]}
+    assert names <= {"w99-3lane", "my-road"}
+    assert all(len(each["error"]) == 2 for each in found["test"])
+
+
+def set_of(path):
+    return str(path.parent / "my-road-fit" / "my-road.json")
+
+
+def test_the_page_shows_road_choice_and_commands(fitted):
+    path, found = fitted
+    page = (path.parent / "my-road-fit" / "page.html").read_text(encoding="utf-8")
+    assert page.count("<img ") == 3
+    for name in ("w99-3lane", "random_walk", "oldest-first", "dptse train", found["rule"]):
+        assert name in page
+    assert all(note.split(":")[0] in page for note in found["notes"])
+
+
+def test_the_same_command_plays_nothing_again_and_changes_no_file_of_yours(fitted):
+    path, found = fitted
+    before = files_of(path.parent)
+    done = run_command("fit", path, *BRIEF, "--json")
+    again = json.loads(done.stdout)
+    assert again["test"] == found["test"]
+    assert again["environment"].items() <= found["environment"].items()
+    after = files_of(path.parent)
+    changed = {each.name for each in after if after[each] != before.get(each)}
+    assert changed <= {"page.html", "rows.parquet"}
+    line = refused("fit", path, *BRIEF, "--training", "0:1")
+    assert "seeds.training is [0, 1] there and [0] now" in line
+
+
+def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
+    corridor, cell, library = search_of(tmp_path)
+    tried = []
+
+    def error(cell, parameters, seeds, library):
+        if len(tried) == 7:
+            raise KeyboardInterrupt
+        tried.append(parameters)
+        return bowl(parameters)
+
+    kept, start = tmp_path / "search.json", start_from(load_parameters("paper"), corridor, "mine")
+    arguments = corridor, cell, (0,), start, 100.0, library, 60, kept
+    monkeypatch.setattr(searching, "filter_error", error)
+    with pytest.raises(KeyboardInterrupt):
+        fit_parameters(*arguments)
+    monkeypatch.setattr(searching, "filter_error", lambda *given: error_of(given, tried))
+    first = fit_parameters(*arguments)
+    assert len({str(each) for each in tried}) == len(tried) <= 60
+    kept.unlink()
+    assert fit_parameters(*arguments) == first
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows kills otherwise")
+def test_a_killed_fit_goes_on_with_what_it_has_tried(tmp_path):
+    path = tmp_path / "my-road.toml"
+    path.write_text(ROAD)
+    command = [sys.executable, "-m", "scripts.dptse", "fit", str(path), *BRIEF, "--tries", "20"]
+    kept = tmp_path / "my-road-fit" / "stages" / "search.json"
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
+        try:
+            deadline = time.monotonic() + 120
+            while not kept.exists() or len(json.loads(kept.read_text())) < 7:
+                assert time.monotonic() < deadline
+                assert process.poll() is None
+                time.sleep(0.02)
+        finally:
+            process.kill()
+    tried = json.loads(kept.read_text())
+    assert path.read_text() == ROAD
+    done = run_command(*command[3:])
+    assert done.returncode == 0, done.stderr
+    after = json.loads(kept.read_text())
+    assert after[: len(tried)] == tried
+    assert len(tried) < len(after) <= 21
+    assert "[environment]" in path.read_text()
+
+
+def error_of(given, tried):
+    tried.append(given[1])
+    return bowl(given[1])
+
+
+def bowl(parameters, v_f=95.0, gamma=0.8):
+    """An error that is least at some parameters."""
+    found = parameters.free_flow_speed / v_f, parameters.gamma / gamma
+    return 50.0 + 100.0 * float(np.sum(np.log(found) ** 2))
+
+
+def search_of(folder):
+    path = folder / "my-road.toml"
+    path.write_text(ROAD)
+    return read_road(path).corridor, Cell(ID), RecordLibrary(folder)
+
+
+def test_the_search_finds_the_least_error_and_says_where_it_ended_at_a_bound(tmp_path, monkeypatch):
+    corridor, cell, library = search_of(tmp_path)
+    start = start_from(load_parameters("w99-3lane"), corridor, "mine")
+    assert (start.lanes, start.derived_from) == (2, "w99-3lane")
+
+    def fit(error, name):
+        monkeypatch.setattr(searching, "filter_error", lambda *given: error(given[1]))
+        kept = tmp_path / name
+        return fit_parameters(corridor, cell, (0,), start, 100.0, library, 100, kept)
+
+    inside = fit(bowl, "inside.json")
+    assert inside.parameters.free_flow_speed == pytest.approx(95.0, rel=0.05)
+    assert inside.parameters.gamma == pytest.approx(0.8, rel=0.05)
+    assert inside.error < 50.5 < inside.start
+    assert not any(each.startswith(("free_flow_speed", "gamma")) for each in inside.at_bounds)
+    outside = fit(lambda p: bowl(p, v_f=20.0), "outside.json")
+    assert any("free_flow_speed ended at 72, the least" in each for each in outside.at_bounds)
+
+
+def test_a_start_is_slowed_down_until_the_time_step_suits_short_segments(tmp_path):
+    path = tmp_path / "short.toml"
+    path.write_text(ROAD.replace("segment_length = 0.1", "segment_length = 0.04"))
+    corridor = read_road(path).corridor
+    start = start_from(load_parameters("w99-3lane"), corridor, "mine")
+    assert not searching.is_stable(load_parameters("w99-3lane"), corridor)
+    assert searching.is_stable(start, corridor)
+    assert start.free_flow_speed > 100.0
+
+
+@pytest.mark.parametrize(
+    ("errors", "chosen"),
+    [
+        ({"ekf": [50, 60, 70, 80], "ukf": [40, 50, 60, 71]}, "ukf"),
+        ({"ekf": [50, 60, 70, 80], "ukf": [20, 63, 73, 83]}, "ekf"),
+        ({"ekf": [50], "ukf": [49]}, "ukf"),
+    ],
+)
+def test_a_choice_changes_for_what_is_certainly_better(errors, chosen, tmp_path, monkeypatch):
+    path = tmp_path / "my-road.toml"
+    path.write_text(ROAD)
+    seeds = {"training": "0:1", "validation": "1000:1001", "test": "2000:2001"}
+    road = find_road(path, ID, tmp_path / "fit", seeds)
+    choice = Choice(road, tmp_path, {"w99-3lane": {}}, parameters="w99-3lane")
+    monkeypatch.setattr(choosing.Choice, "play", lambda self, wanted, place: wanted)
+    monkeypatch.setattr(
+        choosing,
+        "values",
+        lambda rows, labels, metric: np.array(errors[labels["estimator"]], float),
+    )
+    choice.choose([{"estimator": name} for name in errors], Place(tmp_path, THIS_PROCESS))
+    assert (choice.estimator, choice.rule) == (chosen, "round-robin")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '# a\r\nn_mainline = 4  # b\r\n[environment]  # c\r\nparameters = "x.json"  # d\r\n',
+        'n_mainline = 4\n[environment.privacy]\npreset = "capped"\n[demand]\nmainline = []\n',
+        "n_mainline = 4\nenvironment = { bandwidth = 3, estimator_settings = 'x.json' }\n",
+        "[demand]\nmainline = [[0, 1]]",
+    ],
+)
+def test_a_choice_is_written_whatever_the_file_looks_like(text, tmp_path):
+    path = tmp_path / "road.toml"
+    path.write_bytes(text.encode())
+    chosen = {"parameters": "fit/a.json", "estimator": "ekf"}
+    assert write_choice(path, chosen, 9.8)
+    assert copy_of(path).read_bytes() == text.encode()
+    new, old = tomllib.loads(path.read_bytes().decode()), tomllib.loads(text)
+    assert new.pop("average_dwell") == 9.8
+    table = old.pop("environment", {})
+    table.pop("estimator_settings", None)
+    assert new.pop("environment") == {**table, **chosen}
+    assert new == old
+    assert not write_choice(path, chosen, None)
+    assert copy_of(path).read_bytes() == text.encode()
+
+
+NO_DEMAND = ROAD.replace("2400", "0")
+SHORT = ROAD.replace("segment_length = 0.1", "segment_length = [0.1, 0.1, 0.04, 0.1]").replace(
+    "speed_limit = 90", "speed_limit = 140"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "message"),
+    [
+        (NO_DEMAND, [], "my-road.toml: demand.mainline must be above 0 veh/h at some time"),
+        (SHORT, [], "my-road.toml: segment 2 of 0.04 km must be longer than 0.044 km at 140 km/h"),
+        (ROAD.replace("90\n", "60\n", 2), [], "my-road.toml: duration must be more than the 60 s"),
+        (ROAD, ["--test", "1000:1004"], "test must be traffic seeds in 2000..2999"),
+        (ROAD, ["--env", f'{ID} {{"parameters": "paper"}}'], "env.parameters must be left out"),
+        (ROAD, ["--estimators", "kalman"], "estimator must be one of"),
+    ],
+)
+def test_what_cannot_be_fitted_is_one_line_and_leaves_nothing(text, words, message, tmp_path):
+    path = tmp_path / "my-road.toml"
+    path.write_text(text)
+    assert message in refused("fit", path, *words)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_is_no_road_is_told(tmp_path):
+    assert "road must be a road file" in refused("fit", tmp_path / "road.json")
+    assert "my-road.toml" in refused("fit", tmp_path / "my-road.toml")
+
+
+def import_field(folder, windows):
+    """Import a measured field of some windows of 100 s; return its road file."""
+    rng = np.random.default_rng(0)
+    density = 40.0 + 30.0 * rng.random((6, 20 * windows))
+    np.savetxt(folder / "density.txt", density)
+    np.savetxt(folder / "speed.txt", 100.0 - density)
+    done = run_command(
+        "import", "field", "--density", folder / "density.txt", "--speed", folder / "speed.txt",
+        "--cell", "0.1", "--interval", "5", "--name", "ring", "--segments", "4", "--lanes", "2",
+        "--speed-limit", "90", "--duration", "90", "--output", folder / "ring",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder / "ring" / "road.toml"
+
+
+def test_a_measured_field_with_one_test_window_is_fitted(tmp_path):
+    path = import_field(tmp_path, 3)
+    words = ["--tries", "2", "--estimators", "ekf", "--rules", "round-robin", "--workers", "1"]
+    done = run_command("fit", path, *words)
+    assert done.returncode == 0, done.stderr
+    assert "release model 'corrected', since a measured field has no vehicles" in done.stdout
+    assert tomllib.loads(path.read_text())["environment"]["privacy"] == "corrected"
+    page = (path.parent / "road-fit" / "page.html").read_text(encoding="utf-8")
+    assert "There is one test window: its errors have no interval" in page
+    with pytest.warns(UserWarning, match="^estimator_settings: "):
+        env = gym.make(ID, corridor=str(path))
+    assert env.reset(seed=0)[1]["inherited"] == ["estimator_settings"]
+
+
+def test_recordings_of_one_window_say_what_is_missing(tmp_path):
+    path = import_field(tmp_path, 1)
+    before = files_of(path.parent)
+    line = refused("fit", path)
+    assert f"{path}: recordings must have a window of validation traffic" in line
+    assert "shorter duration" in line
+    assert files_of(path.parent) == before
