@@ -24,7 +24,7 @@ PACKAGES = (
     "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "mpmath",
     "filterpy", "qpsolvers", "piqp", "safetensors", "matplotlib", "platformdirs", "tomli-w",
     "tqdm", "torch", "stable-baselines3", "sb3-contrib", "optuna", "plotly", "polars", "loky",
-    "rich", "tyro", "ray", "filelock", "moviepy", "pygame",
+    "rich", "tyro", "ray", "filelock", "moviepy", "pygame", "tomlkit",
 )  # fmt: skip
 
 

@@ -41,7 +41,8 @@ class Episodes:
 
     Attributes:
         corridor: The road.
-        cells: The same as the network sees it.
+        is_section: Whether it is a section of a highway.
+        cells: The road as the network sees it.
         start: Density [veh/km] and speed [km/h] of the prior and their deviations, (k, S, 4).
         observed: Which rows were measured, (T, k, M).
         values: Measurements, (T, k, M, 2).
@@ -52,6 +53,7 @@ class Episodes:
     """
 
     corridor: Corridor
+    is_section: bool
     cells: Cells
     start: AnyArray
     observed: AnyArray
@@ -108,6 +110,7 @@ def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
     observed, values, sigma, centre = measured
     return Episodes(
         corridor=process.config.corridor,
+        is_section=scenario.section is not None,
         cells=make_cells(process.model),
         start=watcher.start,
         observed=observed,
@@ -176,7 +179,7 @@ def draw_batch(rng: np.random.Generator, collected: Sequence[Episodes], n: int) 
         k = min(EACH, left, len(drawn.start))
         parts.append(drawn.pick(np.sort(rng.choice(len(drawn.start), size=k, replace=False))))
         left -= k
-    return Batch(parts)
+    return Batch(sorted(parts, key=lambda part: part.is_section))
 
 
 class Batch:
@@ -198,6 +201,12 @@ class Batch:
         self.start = np.concatenate([part.start.reshape(-1, 4) for part in parts])
         truth = [part.truth.reshape(len(part.truth), -1, 2) for part in parts]
         self.truth = torch.from_numpy(np.concatenate(truth, axis=1)).float()
+
+    @property
+    def ordinary(self) -> Batch | None:
+        """The episodes that are not on sections, which are the first ones; None without any."""
+        parts = [part for part in self._parts if not part.is_section]
+        return Batch(parts) if parts else None
 
     def channels(self, t: int, predicted: FloatArray, age: FloatArray) -> Tensor:
         """Return what the network reads in second t + 1, shape (C, channels).
@@ -221,7 +230,7 @@ class Batch:
 
 def _roads(parts: Sequence[Episodes]) -> Roads:
     """Return the cells of all episodes."""
-    unit, limit, edges, scales, mainline, episode = ([] for _ in range(6))
+    unit, limit, edges, scales, mainline, episode, ordinary = ([] for _ in range(7))
     first = n_episodes = 0
     for part in parts:
         cells, corridor, k = part.cells, part.corridor, len(part.start)
@@ -233,6 +242,7 @@ def _roads(parts: Sequence[Episodes]) -> Roads:
         scales.append(np.tile([corridor.density_scale, corridor.speed_scale], (k * S, 1)))
         mainline.append(np.tile(np.arange(S) < corridor.n_mainline, k))
         episode.append(n_episodes + np.repeat(np.arange(k), S))
+        ordinary.append(np.full(k, not part.is_section))
         first, n_episodes = first + k * S, n_episodes + k
 
     def joined(arrays: list[AnyArray], dtype: torch.dtype) -> Tensor:
@@ -245,5 +255,6 @@ def _roads(parts: Sequence[Episodes]) -> Roads:
         scales=joined(scales, torch.float32),
         mainline=joined(mainline, torch.float32),
         episode=joined(episode, torch.int64),
+        ordinary=joined(ordinary, torch.float32),
         n_episodes=n_episodes,
     )

@@ -28,6 +28,7 @@ class Roads(NamedTuple):
     scales: Tensor  # (C, 2) of errors of densities [veh/km] and speeds [km/h]
     mainline: Tensor  # (C,) flags
     episode: Tensor  # (C,) index of the episode
+    ordinary: Tensor  # (k,) flags of the episodes that are not on sections of highways
     n_episodes: int
 
     def per_episode(self, values: Tensor) -> Tensor:
@@ -120,7 +121,13 @@ def _outputs(roads: Roads, raw: Tensor) -> Tensor:
     return torch.stack(parts, -1)
 
 
-def second_loss(roads: Roads, estimated: Tensor, truth: Tensor, likelihood: float) -> Tensor:
+def second_loss(
+    roads: Roads,
+    estimated: Tensor,
+    truth: Tensor,
+    likelihood: float,
+    weight: Tensor | None = None,
+) -> Tensor:
     """Return the loss of a second, averaged over episodes and all leading dimensions.
 
     The environment's error over the mainline, and `likelihood` times the negative log-likelihood
@@ -131,6 +138,7 @@ def second_loss(roads: Roads, estimated: Tensor, truth: Tensor, likelihood: floa
         estimated: Shape (..., C, 4).
         truth: Shape (..., C, 2).
         likelihood: Weight of the likelihood.
+        weight: Weights of the episodes, shape (k,); 1 if None.
     """
     error = (estimated[..., :2] - truth) / roads.scales
     spread = estimated[..., 2:] / roads.scales
@@ -141,4 +149,16 @@ def second_loss(roads: Roads, estimated: Tensor, truth: Tensor, likelihood: floa
     mean = total / roads.per_episode(mainline.sum(-1))
     surprise = (torch.log(spread) + 0.5 * (error / spread) ** 2) * counts
     each = roads.per_episode(surprise.sum(-1)) / roads.per_episode(counts.sum(-1))
-    return torch.sqrt(mean + 1e-8).mean() + likelihood * each.mean()
+    loss = torch.sqrt(mean + 1e-8) + likelihood * each
+    return loss.mean() if weight is None else (loss * weight).mean()
+
+
+def teacher_loss(roads: Roads, estimated: Tensor, taught: Tensor) -> Tensor:
+    """Return how far estimates are from those of another network, averaged over all cells.
+
+    Ten times the squared difference of means, on the scale of errors, and 0.03 times that of the
+    logarithms of deviations. Both arguments have shape (..., C, 4).
+    """
+    means = (estimated[..., :2] - taught[..., :2]) / roads.scales
+    spreads = torch.log(estimated[..., 2:] / taught[..., 2:])
+    return 10.0 * (means**2).sum(-1).mean() + 0.03 * (spreads**2).sum(-1).mean()

@@ -105,6 +105,8 @@ class FilterPlan:
         checkpoint_every: Passes between checkpoints.
         initial: Network whose weights the training begins with, a name or a file; None for weights
             drawn at random.
+        teacher: Part of the loss on ordinary roads that holds the network to what the initial one
+            says there.
 
     Raises:
         ValueError: A value is out of range.
@@ -133,6 +135,7 @@ class FilterPlan:
     clip_norm: Annotated[float, Interval(0, 1e6, open_low=True)] = 1.0
     checkpoint_every: Annotated[int, Interval(1, 1_000_000)] = 100
     initial: str | None = None
+    teacher: Annotated[float, Interval(0, 1)] = 0.0
 
     def __post_init__(self) -> None:
         """Check values."""
@@ -153,6 +156,8 @@ class FilterPlan:
                 "rounds must begin with one of another estimator where no initial network is "
                 "given, since the network knows nothing yet"
             )
+        taught = self.initial is not None or self.teacher == 0.0
+        require(taught, "teacher", "0 without an initial network", self.teacher)
         if self.initial is not None:
             width = read_network(self.initial).network.width
             allowed = f"that of the initial network, {width}"

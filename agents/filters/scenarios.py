@@ -27,8 +27,11 @@ SCHEDULES = (
     "largest-variance", "largest-deviation", "expected-reduction",
 )  # fmt: skip
 """Query policies that scenarios draw from; the last four follow the estimator's own deviations."""
-BOUNDARIES = ("true", "nominal", "private")
-"""Sources of the boundary inputs that scenarios draw from."""
+BOUNDARIES: dict[Kind, dict[str, float]] = {
+    "flows": {"true": 0.3, "nominal": 0.45, "private": 0.25},
+    "speeds": {"true": 0.8, "nominal": 0.1, "private": 0.1},
+}
+"""Sources of the boundary inputs, and how likely each is where it is not the usual one."""
 PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
 
 
@@ -151,7 +154,7 @@ class ScenarioRanges:
     ) -> Scenario:
         """Draw a scenario.
 
-        The bandwidth is drawn from 1 to all segments, evenly in its logarithm.
+        The bandwidth is drawn from 1 to all segments, evenly in its square root.
 
         Args:
             rng: Source of randomness.
@@ -176,15 +179,18 @@ class ScenarioRanges:
             keywords |= {"horizon": seconds, "random_start": seconds < corridor.duration}
         privacy = self._draw_privacy(rng, mechanism)
         if section is not None or rng.random() < 0.3:
-            known = BOUNDARIES[: 2 if section and section.averaged else 3]
-            privacy["boundary_inputs"] = str(rng.choice(known))
+            chances = dict(BOUNDARIES[kind])
+            if section and section.averaged:
+                chances["nominal"] += chances.pop("private")  # a field has no vehicles to protect
+            source = rng.choice(list(chances), p=list(chances.values()))
+            privacy["boundary_inputs"] = str(source)
         largest = n_mainline
         if mechanism == "paced":
             spans = self.spans[int(rng.integers(len(self.spans)))]
             if spans != (1,):
                 keywords |= {"query_spans": list(spans), "bandwidth_unit": "sums"}
                 largest = max(2 * n_mainline // 3, 1)
-        bandwidth = int(np.exp(rng.uniform(0.0, np.log(largest + 1.0))))
+        bandwidth = 1 + int(largest * rng.random() ** 2)
         return Scenario(
             env=env,
             keywords={**keywords, "privacy": privacy, "bandwidth": bandwidth},

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
 from agents.filters.collecting import Batch, Episodes, collect, draw_batch
-from agents.filters.network import RecurrentNetwork, second_loss
+from agents.filters.network import RecurrentNetwork, second_loss, teacher_loss
 from agents.filters.plan import OWN, FilterPlan, played_by
 from agents.play import play
 from agents.training.run_files import (
@@ -54,6 +54,25 @@ class State(NamedTuple):
     hidden: Tensor  # (C, H)
     predicted: FloatArray  # of the next second, with deviations, (C, 4)
     age: FloatArray  # seconds since the last measurement of each cell, (C,)
+
+
+def _begin(batch: Batch, width: int) -> State:
+    """Return the state before the first second."""
+    n = len(batch.start)
+    return State(torch.zeros(n, width), batch.start, np.full(n, LONGEST_AGE))
+
+
+def _advance(
+    network: RecurrentNetwork, batch: Batch, window: range, state: State
+) -> tuple[State, Tensor, Tensor]:
+    """Return the state after some seconds, and what a network says of them and of the next ones."""
+    (hidden, predicted, age), kept = state, []
+    hidden = hidden.detach()
+    for t in window:
+        hidden = network(batch.roads, batch.channels(t, predicted, age), hidden)
+        predicted = network.read(batch.roads, hidden.detach())[1].detach().numpy().astype(float)
+        kept.append(hidden)
+    return State(hidden, predicted, age), *network.read(batch.roads, torch.stack(kept))
 
 
 class FilterTraining:
@@ -106,6 +125,7 @@ class FilterTraining:
             self.network.take(read_network(plan.initial).network)
         self._optimiser = torch.optim.Adam(self.network.parameters(), plan.learning_rate)
         self._average = copy.deepcopy(self.network)
+        self._teacher = copy.deepcopy(self.network) if plan.teacher > 0.0 else None
         self.done, self._seconds = 0, 0.0
         self.rows: list[Row] = []
         if checkpoint is not None:
@@ -145,11 +165,12 @@ class FilterTraining:
             group["lr"] = rate
         rng = np.random.default_rng([plan.seed, 2**31, self.done])
         batch = draw_batch(rng, collected, plan.episodes)
-        age = np.full(len(batch.start), LONGEST_AGE)
-        state = State(torch.zeros(len(age), plan.width), batch.start, age)
+        taught = batch.ordinary if self._teacher is not None else None
+        states = [_begin(each, plan.width) for each in (batch, taught) if each is not None]
         losses, errors = [], []
-        for first in range(0, len(batch.truth), plan.window):
-            state, loss, error = self._window(batch, first, state)
+        for first in range(0, plan.seconds, plan.window):
+            window = range(first, min(first + plan.window, plan.seconds))
+            loss, error = self._window(batch, taught, window, states)
             losses.append(loss)
             errors.append(error)
         self.done += 1
@@ -169,23 +190,29 @@ class FilterTraining:
         elif self.done % SHOWN_EVERY == 0 and self.done > plan.checkpoint_every:
             write_progress(self.folder, self.rows, COLUMNS)
 
-    def _window(self, batch: Batch, first: int, state: State) -> tuple[State, float, float]:
-        """Update the weights by some seconds; return the state after them, loss and error."""
+    def _window(
+        self, batch: Batch, taught: Batch | None, window: range, states: list[State]
+    ) -> tuple[float, float]:
+        """Update the weights by some seconds and replace the states; return loss and error."""
         plan, network, roads = self.plan, self.network, batch.roads
-        seconds = range(first, min(first + plan.window, len(batch.truth)))
-        (hidden, predicted, age), kept = state, []
-        hidden = hidden.detach()
-        for t in seconds:
-            hidden = network(roads, batch.channels(t, predicted, age), hidden)
-            predicted = network.read(roads, hidden.detach())[1].detach().numpy().astype(float)
-            kept.append(hidden)
-        present, ahead = network.read(roads, torch.stack(kept))
-        truth, after = (batch.truth[seconds.start + k : seconds.stop + k] for k in (0, 1))
-        loss = second_loss(roads, present, truth, plan.likelihood)
+        states[0], present, ahead = _advance(network, batch, window, states[0])
+        truth, after = (batch.truth[window.start + k : window.stop + k] for k in (0, 1))
+        weight = 1.0 - plan.teacher * roads.ordinary if taught is not None else None
+        loss = second_loss(roads, present, truth, plan.likelihood, weight)
         error = float(second_loss(roads, present.detach(), truth, 0.0))
         if len(after) > 0:
-            of_next = second_loss(roads, ahead[: len(after)], after, plan.likelihood)
+            of_next = second_loss(roads, ahead[: len(after)], after, plan.likelihood, weight)
             loss = loss + plan.prediction * of_next
+        if taught is not None and self._teacher is not None:
+            with torch.no_grad():
+                states[1], *said = _advance(self._teacher, taught, window, states[1])
+            n = len(taught.start)  # ordinary scenarios come first
+            for own, of_teacher, factor in zip(
+                (present, ahead), said, (1.0, plan.prediction), strict=True
+            ):
+                lesson = teacher_loss(taught.roads, own[:, :n], of_teacher)
+                share = taught.roads.n_episodes / roads.n_episodes
+                loss = loss + plan.teacher * share * factor * lesson
         self._optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(network.parameters(), plan.clip_norm)
@@ -193,7 +220,7 @@ class FilterTraining:
         with torch.no_grad():
             for mean, last in zip(self._average.parameters(), network.parameters(), strict=True):
                 mean.lerp_(last, 1.0 - AVERAGING)
-        return State(hidden, predicted, age), float(loss.detach()), error
+        return float(loss.detach()), error
 
     def _validate(self) -> Row:
         """Return mean errors over all cells of a validation, and over those on sections."""

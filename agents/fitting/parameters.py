@@ -41,7 +41,8 @@ MEANING = {
         "the shortest segments and steps of 1 s allow no higher one; longer segments would"
     ),
     ("jam_density", "least"): (
-        "the filter would take a road that is full at less, but traffic as dense was recorded"
+        "the settings' process noise is in units of it, and the filter would take less noise; but "
+        "traffic as dense as this was recorded, or no jam at all"
     ),
     ("jam_density", "largest"): "no jam was recorded that would tell how dense one is",
     ("gamma", "least"): (

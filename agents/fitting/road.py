@@ -166,9 +166,9 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
         require(key not in given, f"env.{key}", "left out", given.get(key))
     _check_road(path, corridor)
     present = {key: value for key, value in road.environment.items() if key in CHOSEN}
-    own, known = str(folder.absolute()), available_parameters()
-    foreign = [present.get(key) for key in ("parameters", "estimator_settings")]
-    if all(each is None or str(each).startswith(own) or each in known for each in foreign):
+    arz = present.get("parameters")
+    is_own = arz is None or arz in available_parameters() or _lies_in(arz, folder)
+    if is_own and "estimator_settings" not in present:
         present = {}
     keywords = {k: v for k, v in road.environment.items() if k not in (*CHOSEN, "traffic_seeds")}
     keywords |= given
@@ -198,6 +198,11 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
 
 def _preset(env: str) -> str:
     return str(gym.spec(env.rpartition(":")[2]).kwargs["preset"])
+
+
+def _lies_in(value: Any, folder: Path) -> bool:
+    """Return whether a value names a file in a folder."""
+    return isinstance(value, str) and Path(value).is_relative_to(folder.absolute())
 
 
 def _check_road(path: Path, corridor: Corridor) -> None:

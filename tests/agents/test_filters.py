@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch")
 from agents.environments import make_config, make_vector, parse_env  # noqa: E402
 from agents.filters.collecting import Batch, collect, draw_batch  # noqa: E402
 from agents.filters.highways import LENGTHS, LIMITS, Section, draw_highway  # noqa: E402
-from agents.filters.network import RecurrentNetwork, second_loss  # noqa: E402
+from agents.filters.network import RecurrentNetwork, second_loss, teacher_loss  # noqa: E402
 from agents.filters.plan import OWN, FilterPlan, Round, played_by  # noqa: E402
 from agents.filters.scenarios import MECHANISMS, ROADS, SCHEDULES, ScenarioRanges  # noqa: E402
 from agents.filters.training import WEIGHTS, FilterTraining  # noqa: E402
@@ -277,6 +277,24 @@ def test_the_loss_is_the_environments_error():
     assert second_loss(roads, wide, truth, 1.0) > second_loss(roads, estimated, truth, 1.0)
 
 
+def test_a_teacher_is_heard_on_ordinary_roads_alone(night):
+    ranges = dataclasses.replace(RANGES, highways=(night, night + 1))
+    (on_section,) = drawn(ranges, n=1, on_section=True)
+    parts = [collect(on_section, WALK, None), collect(mixed("paced"), WALK, None)]
+    batch = draw_batch(np.random.default_rng(1), parts, 6)
+    ordinary, n = batch.ordinary, int(batch.roads.ordinary.sum())
+    assert 0 < n == ordinary.roads.n_episodes < 6
+    assert batch.roads.ordinary.tolist() == [1.0] * n + [0.0] * (6 - n)
+    np.testing.assert_array_equal(batch.truth[:, : len(ordinary.start)], ordinary.truth)
+    assert Batch([parts[0].pick(np.arange(2))]).ordinary is None
+    said = torch.cat([ordinary.truth, torch.ones_like(ordinary.truth)], -1)
+    assert float(teacher_loss(ordinary.roads, said, said)) == 0.0
+    wide = said * torch.tensor([1.0, 1.0, np.e, 1.0])
+    assert float(teacher_loss(ordinary.roads, wide, said)) == pytest.approx(0.03)
+    scales = torch.cat([ordinary.roads.scales, torch.zeros_like(ordinary.roads.scales)], -1)
+    assert float(teacher_loss(ordinary.roads, said + 0.1 * scales, said)) == pytest.approx(0.2)
+
+
 # Training -----------------------------------------------------------------------------------------
 
 
@@ -331,7 +349,9 @@ def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_p
     assert ranges["span"] == [1.0, 2.0]
     assert ranges["flows"] == [1.0, 1.0]
     assert ranges["n_mainline"] == [6, 6]
-    plan = dataclasses.replace(PLAN, initial=str(path), rounds=(Round(OWN, 1, 1),), seed=5)
+    plan = dataclasses.replace(
+        PLAN, initial=str(path), teacher=0.5, rounds=(Round(OWN, 1, 1),), seed=5
+    )
     second = FilterTraining(plan, tmp_path / "b")
     for taken, given in zip(second.network.weights(), read_network(str(path)).network, strict=True):
         np.testing.assert_array_equal(taken, given)
@@ -356,6 +376,7 @@ def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_p
         ({"rounds": (Round(OWN, 1, 1),)}, "rounds must begin with one of another estimator"),
         ({"rounds": ()}, "rounds must begin"),
         ({"windows": 4}, r"windows must be an integer in 1\.\.3, got 4"),
+        ({"teacher": 0.5}, "teacher must be 0 without an initial network, got 0.5"),
         ({"kind": "densities"}, "kind must be one of 'flows', 'speeds', got 'densities'"),
         ({"validation_highways": (5, 9)}, r"validation_highways must be .* outside of \(0, 80\)"),
         ({"initial": "nowhere"}, r"weights must be a file or one of highway, .*, got 'nowhere'"),

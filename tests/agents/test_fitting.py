@@ -1,5 +1,6 @@
 """A road is fitted: what is searched, what is chosen, and what its file says afterwards."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -23,7 +24,8 @@ from agents.fitting.road_file import copy_of, write_choice
 from agents.play import Cell
 from agents.study import Place
 from dptse_env.model import load_parameters
-from dptse_env.traffic import RecordLibrary, read_road
+from dptse_env.model.parameters import write_parameters
+from dptse_env.traffic import RecordLibrary, read_road, write_corridor
 from tests.scripts.commands import ROOT, refused, run_command
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
@@ -229,6 +231,36 @@ def test_a_choice_changes_for_what_is_certainly_better(errors, chosen, tmp_path,
     )
     choice.choose([{"estimator": name} for name in errors], Place(tmp_path, THIS_PROCESS))
     assert (choice.estimator, choice.rule) == (chosen, "round-robin")
+
+
+@pytest.mark.parametrize(
+    ("table", "kept"),
+    [
+        ({"estimator": "asm"}, False),
+        ({"parameters": "paper"}, False),
+        ({"parameters": "fit/my-road.json"}, False),
+        ({"parameters": "mine/my-road.json"}, True),
+        ({"parameters": "fit/my-road.json", "estimator_settings": "fit/tuned.json"}, True),
+    ],
+)
+def test_a_choice_of_yours_is_among_what_is_compared(table, kept, tmp_path):
+    path = tmp_path / "my-road.toml"
+    write_corridor(path, read_road_of(ROAD, path), table)
+    seeds = {"training": None, "validation": None, "test": None}
+    for name in ("fit/my-road.json", "mine/my-road.json"):
+        (tmp_path / name).parent.mkdir()
+        arz = dataclasses.replace(load_parameters("paper"), name="my-road")
+        write_parameters(tmp_path / name, arz, {})
+    settings = {"estimator": "ekf", "settings": {}, "provenance": {}}
+    (tmp_path / "fit" / "tuned.json").write_text(json.dumps({"a": settings}))
+    road = find_road(path, ID, tmp_path / "fit", seeds)
+    assert set(road.present) == (set(table) if kept else set())
+    assert len(road.all_seeds) == 32
+
+
+def read_road_of(text, path):
+    path.write_text(text)
+    return read_road(path).corridor
 
 
 @pytest.mark.parametrize(

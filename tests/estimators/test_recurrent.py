@@ -109,6 +109,7 @@ class Twin:
             torch.ones(n * S, 2),
             torch.ones(n * S),
             torch.arange(n).repeat_interleave(S),
+            torch.ones(n),
             n,
         )
         said = estimator.estimate()

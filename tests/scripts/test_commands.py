@@ -69,6 +69,9 @@ def test_the_example_of_the_help_runs_as_it_is_printed(name, tmp_path, monkeypat
     page = help_of(name, monkeypatch)
     line = re.search(r"^dptse ((?:.*\\\n)*.*)", page, re.MULTILINE)[1].replace("\\\n", " ")
     write_data(tmp_path)
+    if name == "fit":
+        road = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
+        (tmp_path / "my-road.toml").write_text(road)
     if "--report" in line:
         shutil.copytree(ROOT / "results" / "paper", tmp_path / "results" / "paper")
     monkeypatch.chdir(tmp_path)

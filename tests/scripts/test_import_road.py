@@ -123,7 +123,8 @@ def commands_of(name):
 
 
 SMALL = {
-    "fit": ["--tries", "1", "--estimators", "ekf", "--rules", "round-robin"],
+    "fit": ["--tries", "1", "--estimators", "ekf", "--rules", "round-robin", "--workers", "1"],
+    "evaluate": ["--workers", "1"],
     "train": ["--algorithm", 'ppo {"steps": 2000}'],
 }
 """What makes commands of the page short."""
@@ -156,7 +157,7 @@ def test_the_page_on_own_data_goes_on_to_a_policy(fifteen_minutes, monkeypatch):
     following = re.search(r"^next: dptse (evaluate .*)$", printed, re.MULTILINE)[1]
     if not Path("us-101").exists():
         run(*first[1:])
-    for words in (*rest, shlex.split(following)):
+    for words in (*rest, [*shlex.split(following), "--output", "following"]):
         done = run_command(*words, *SMALL.get(words[0], []))
         assert done.returncode == 0, done.stderr
     assert "1 episode on test traffic" in done.stdout
