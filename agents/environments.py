@@ -64,6 +64,11 @@ def parse_env(text: str) -> tuple[str, dict[str, Any]]:
     return env, keywords
 
 
+def preset_of(env: str) -> str:
+    """Return the name of the preset of an environment that `parse_env` has found."""
+    return str(gym.spec(env.rpartition(":")[2]).kwargs["preset"])
+
+
 def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:
     """Return the configuration of an environment.
 

@@ -50,8 +50,11 @@ def require_seeds(path: str, seeds: Sequence[int], allowed: range) -> None:
         )
 
 
+KINDS = {"training": TRAINING_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+"""Kinds of traffic, and the seeds that each may have."""
+
+
 def seed_kind(seeds: Sequence[int]) -> str:
     """Return which range traffic seeds belong to: training, validation, test, or mixed."""
-    ranges = {"training": TRAINING_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
-    kinds = [name for name, members in ranges.items() if set(seeds) <= set(members)]
+    kinds = [name for name, members in KINDS.items() if set(seeds) <= set(members)]
     return kinds[0] if kinds else "mixed"

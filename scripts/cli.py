@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import tyro
 
-from agents.environments import parse_env, quietly
+from agents.environments import parse_env, preset_of, quietly
 from agents.executors import AnyExecutor, ExecutorError, ExecutorName, make_executor
 from agents.play import PlayError, record
 from agents.study import Place
@@ -47,9 +46,8 @@ class Environment:
         env, keywords = parse_env(self.env)
         # Traffic does not depend on queries, and a short road may have fewer segments.
         queries = {"bandwidth": 1, "query_spans": [1]} if "corridor" in keywords else {}
-        preset = gym.spec(env.rpartition(":")[2]).kwargs["preset"]
         with quietly():
-            return resolve(preset, {**queries, **keywords}).corridor
+            return resolve(preset_of(env), {**queries, **keywords}).corridor
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from tyro.conf import arg
 
 from agents.environments import parse_env
 from agents.files import refuse_to_replace
-from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
+from agents.seeds import KINDS
 from dptse_env.importers import Options, Source, Split, import_trajectories, read_source
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import ROAD
@@ -253,9 +253,8 @@ def main(args: Args) -> None:
 
 def splits(shares: Iterable[float]) -> list[Split]:
     """Return the parts of the windows."""
-    seeds = {"training": TRAINING_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
     return [
-        Split(name, share, each) for (name, each), share in zip(seeds.items(), shares, strict=True)
+        Split(name, share, each) for (name, each), share in zip(KINDS.items(), shares, strict=True)
     ]
 
 

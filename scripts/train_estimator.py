@@ -26,7 +26,7 @@ import torch
 from tqdm import tqdm
 
 from agents.environments import make_config, parse_env, quietly
-from agents.executors import run_shown
+from agents.executors import THIS_PROCESS, AnyExecutor, run_shown
 from agents.filters.highways import draw_highway
 from agents.filters.plan import FilterPlan, Round
 from agents.filters.scenarios import Kind, ScenarioRanges
@@ -126,16 +126,20 @@ def main(args: Args) -> None:
     ]
     for plan, folder in tasks:
         check_plan(folder, plan.settings())
-    for plan in {plan.kind: plan for plan, _ in tasks}.values():
+    plans = list({plan.kind: plan for plan, _ in tasks}.values())
+    for plan in plans:
         plan.check()
-        record_all(args, plan)
     executor = args.start_executor()
+    record_all(args, plans, executor)
     last: dict[Path, Row] = {}
     with followed(tasks):
-        work = partial(train, records=args.records)
-        run_shown(
-            executor, work, tasks, lambda task, row: last.update({task[1]: row}), progress=False
-        )
+        if len(tasks) == 1:  # the workers then play its scenarios
+            last[tasks[0][1]] = train(tasks[0], args.records, executor)
+        else:
+            work = partial(train, records=args.records)
+            run_shown(
+                executor, work, tasks, lambda task, row: last.update({task[1]: row}), progress=False
+            )
     table = make_table("on validation traffic", "training", "error x 1000", "on sections", "chi2")
     for folder, row in sorted(last.items()):
         errors = [f"{1000 * row[name]:.1f}" for name in ("validation", "sections") if name in row]
@@ -151,27 +155,43 @@ def main(args: Args) -> None:
     print(json.dumps({"estimator": "recurrent", "estimator_settings": settings}))
 
 
-def train(task: Task, records: Path | None) -> Row:
+def train(task: Task, records: Path | None, executor: AnyExecutor = THIS_PROCESS) -> Row:
     """Run a training to its end, and return the last row of its learning curve."""
     plan, folder = task
     torch.set_num_threads(1)
-    training = FilterTraining(plan, folder, records=records)
+    training = FilterTraining(plan, folder, records=records, executor=executor)
     training.run()
     return training.rows[-1]
 
 
-def record_all(args: Args, plan: FilterPlan) -> None:
-    """Record the traffic of the environments and highways of a plan that is missing."""
-    for envs, seeds in (
-        (plan.ranges.envs, plan.traffic_seeds), (plan.validation_envs, plan.validation_seeds)
-    ):  # fmt: skip
-        for env in envs:
-            with quietly():
-                corridor = make_config(*parse_env(env)).corridor
-            args.library(corridor, seeds)
-    numbers = [*range(*plan.ranges.highways), *range(*plan.validation_highways)]
-    for number in tqdm(numbers, desc="highways", unit="record"):
-        record(draw_highway(number), [0], args.records, workers=args.workers)
+def record_all(args: Args, plans: Sequence[FilterPlan], executor: AnyExecutor) -> None:
+    """Record the traffic of the environments and highways of plans that is missing."""
+    wanted = dict.fromkeys(
+        (env, seeds)
+        for plan in plans
+        for envs, seeds in (
+            (plan.ranges.envs, plan.traffic_seeds),
+            (plan.validation_envs, plan.validation_seeds),
+        )
+        for env in envs
+    )
+    for env, seeds in wanted:
+        with quietly():
+            corridor = make_config(*parse_env(env)).corridor
+        args.library(corridor, seeds)
+    numbers = dict.fromkeys(
+        number
+        for plan in plans
+        for span in (plan.ranges.highways, plan.validation_highways)
+        for number in range(*span)
+    )
+    work = partial(record_highway, records=args.records)
+    run_shown(executor, work, list(numbers), lambda *done: None, desc="highways", unit="record")
+
+
+def record_highway(number: int, records: Path | None) -> None:
+    """Record a highway if it is missing."""
+    record(draw_highway(number), [0], records, workers=1)
 
 
 @contextlib.contextmanager

@@ -34,7 +34,10 @@ from tests.helpers import UNEVEN
 
 FILE = Path(__file__).with_suffix(".npz")
 ID = "dptse_env:dptse/{}"
-ESTIMATORS = ("ekf", "ukf", "enkf", "mhe", "random_walk", "blend", "open_loop", "recurrent")
+ESTIMATORS = (
+    "ekf", "ukf", "enkf", "mhe", "random_walk", "blend", "open_loop", "recurrent",
+    "asm",
+)  # fmt: skip
 
 FROM_SECOND, STEPS = 240, 3  # a queue stands on the paper's road from second 200 on
 ROADS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -259,11 +262,6 @@ def cases() -> Iterator[tuple[str, Any, tuple[Any, ...]]]:
     yield "errors LongHighway-v0 ekf", mean_errors, ("LongHighway-v0", "ekf")
 
 
-def serves(road: str, estimator: str) -> bool:
-    """Return whether an estimator is recorded on a road: the network asks for others' settings."""
-    return not (estimator == "recurrent" and road in ("paper", "paced-uneven"))
-
-
 def main(words: list[str]) -> None:
     """Write the file, or the parts whose names have one of some words."""
     found: Numbers = {}
@@ -277,7 +275,7 @@ def main(words: list[str]) -> None:
     for road in filter(is_due, ROADS):
         given = recorded_steps(road)
         found |= {f"steps {road}/{key}": value for key, value in given.items()}
-        for estimator in filter(functools.partial(serves, road), ESTIMATORS):
+        for estimator in ESTIMATORS:
             made = estimator_steps(road, estimator, given)
             found |= {f"steps {road} {estimator}/{key}": value for key, value in made.items()}
             print(road, estimator, flush=True)

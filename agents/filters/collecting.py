@@ -31,9 +31,6 @@ from dptse_env.traffic import Corridor, Records, open_library
 from dptse_env.utils.arrays import AnyArray, FloatArray
 from dptse_env.vector_env import SensorQueryVectorEnv
 
-EACH = 1
-"""Episodes of one scenario in a batch."""
-
 
 @dataclass(frozen=True)
 class Episodes:
@@ -172,13 +169,11 @@ def _single(array: AnyArray) -> AnyArray:
 
 
 def draw_batch(rng: np.random.Generator, collected: Sequence[Episodes], n: int) -> Batch:
-    """Return `n` episodes of scenarios that are drawn with replacement, `EACH` of one at most."""
-    parts, left = list[Episodes](), n
-    while left > 0:
+    """Return `n` episodes, each of a scenario that is drawn anew."""
+    parts = []
+    for _ in range(n):
         drawn = collected[int(rng.integers(len(collected)))]
-        k = min(EACH, left, len(drawn.start))
-        parts.append(drawn.pick(np.sort(rng.choice(len(drawn.start), size=k, replace=False))))
-        left -= k
+        parts.append(drawn.pick(rng.integers(len(drawn.start), size=1)))
     return Batch(sorted(parts, key=lambda part: part.is_section))
 
 

@@ -275,11 +275,11 @@ def _averaged(road: Corridor, record: Record, seconds: int) -> Record:
         uniform_filter1d(each.astype(float), seconds, axis=0, mode="nearest")
         for each in (record.counts, record.speed_sums)
     )
-    limits = np.array(road.with_boundaries(road.speed_limits))
     # Sums of a running window leave rests of some 1e-13 where it is empty again.
-    is_empty = counts < 0.5 / seconds
-    density = np.where(is_empty, 0.0, counts) / np.array(road.with_boundaries(road.segment_lengths))
-    speed = np.where(is_empty, limits, np.maximum(speeds, 0.0) / np.maximum(counts, 0.5 / seconds))
+    least = 0.5 / seconds
+    lengths = np.array(road.with_boundaries(road.segment_lengths))
+    density = np.where(counts < least, 0.0, counts) / lengths
+    speed = np.maximum(speeds, 0.0) / np.maximum(counts, least)
     return Record(
         n_steps=record.n_steps,
         n_columns=record.n_columns,

@@ -36,7 +36,7 @@ WEIGHTS, PLAYED = "network.safetensors", "played.safetensors"
 """The trained network, and the network that the scenarios of a round are collected with."""
 SECTIONS = "sections"
 """Folder of the sections to validate on."""
-AVERAGING = 0.995
+AVERAGING = 0.998
 """Decay of the moving average of weights in an update. Batches differ so much that the last weights
 are biased towards the last batches: densities were 4 to 11 veh/km too large."""
 SHOWN_EVERY = 10
@@ -97,7 +97,6 @@ class FilterTraining:
         *,
         records: Records = None,
         watchers: Sequence[Watcher] = (),
-        progress: Callable[[str, float], None] = lambda stage, fraction: None,
         executor: AnyExecutor = THIS_PROCESS,
     ) -> None:
         """Take the folder and restore its state.
@@ -107,7 +106,6 @@ class FilterTraining:
             folder: The folder; made if it is missing.
             records: Library of records, or its folder; None for the user's cache.
             watchers: Receive every row of the learning curve, those read from the folder first.
-            progress: Called with the name of a stage and the fraction of it that is done.
             executor: Plays the scenarios.
 
         Raises:
@@ -116,7 +114,7 @@ class FilterTraining:
         """
         self.plan, self.folder, self._records = plan, folder, records
         self._executor = executor
-        self._watchers, self._progress = watchers, progress
+        self._watchers = watchers
         checkpoint = read_checkpoint(folder)
         keep_plan(folder, plan.settings())
         torch.manual_seed(plan.seed)
@@ -153,9 +151,7 @@ class FilterTraining:
         name = self.plan.rounds[index].estimator
         estimator = played_by(self.folder / PLAYED) if name == OWN else {"estimator": name}
         work = partial(collect, estimator=estimator, records=self._records)
-        on_done = partial(self._progress, f"round {index + 1}, collecting")
-        scenarios = self.plan.scenarios(index)
-        return run_in_order(self._executor, work, scenarios, on_done, progress=False)
+        return run_in_order(self._executor, work, self.plan.scenarios(index), progress=False)
 
     def _pass(self, index: int, collected: Sequence[Episodes]) -> None:
         """Pass over some episodes, drawn from all scenarios."""

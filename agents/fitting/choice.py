@@ -1,4 +1,4 @@
-"""What a fit compares on validation traffic, what it chooses there, and what it plays on test.
+"""Comparisons of a fit on validation traffic, its choices there, and its episodes on test traffic.
 
 Each choice is made with the one before it: the parameters with an EKF and round robin, the
 estimator with these parameters, the query rule with this estimator.
@@ -44,7 +44,7 @@ PRESENT = "present"
 
 @dataclass
 class Choice:
-    """What is compared, and what was chosen so far.
+    """The options of a fit, and its choices so far.
 
     Attributes:
         road: The road.

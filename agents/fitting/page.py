@@ -25,7 +25,7 @@ from agents.fitting.choice import FILTER, ROUND_ROBIN, Choice
 from agents.page import watch
 from agents.statistics import mean_interval
 from agents.study import Place
-from agents.tables import DENSITY, ERROR, SPEED, Labels, pick, values_of
+from agents.tables import DENSITY, ERROR, SPEED, Labels, give_or_take, pick, values_of
 from dptse_env.model import ARZParameters
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import FloatArray
@@ -45,7 +45,7 @@ HONESTY = ("chi2_density", "chi2_speed")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a page is made of.
+    """The content of a page.
 
     Attributes:
         choice: What was compared and chosen, with the rows of test traffic.
@@ -70,8 +70,7 @@ def interval(values: FloatArray) -> str:
     """Return mean and half of the 95 % interval; of one value that value."""
     if len(values) < 2:
         return f"{values.item():.1f}"
-    found = mean_interval(values)
-    return f"{found.mean:.1f} ± {found.half_width:.1f}"
+    return give_or_take(mean_interval(values))
 
 
 def against(choice: Choice, labels: Labels, reference: Labels, metric: str = ERROR) -> str:

@@ -52,7 +52,7 @@ MEANING = {
     ("relaxation_time", "least"): "drivers follow the density at once",
     ("relaxation_time", "largest"): "speeds keep what they had at the entry: none relaxes",
 }
-"""What it means that a parameter ended at a bound."""
+"""Meaning of a parameter that ended at a bound."""
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
-from agents.environments import parse_env, quietly
+from agents.environments import parse_env, preset_of, quietly
 from agents.files import first_difference, write_json
-from agents.seeds import require_seeds
+from agents.seeds import KINDS, require_seeds
 from dptse_env.config import (
     PRESETS,
-    TEST_SEEDS,
-    TRAINING_SEEDS,
-    VALIDATION_SEEDS,
     EnvConfig,
     parse_seeds,
     resolve,
@@ -43,11 +38,8 @@ from dptse_env.utils.fields import read_json, require
 CHOSEN = ("parameters", "estimator", "estimator_settings")
 """Keywords of an environment that a fit decides."""
 
-KINDS = {"training": TRAINING_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
-"""Kinds of traffic, and the seeds that each may have."""
-
 BEGUN, PLAYED = "begun.json", "road.toml"
-"""What a fit was begun with, and the road that its episodes are played on."""
+"""Files of the arguments of a fit, and of the road that its episodes are played on."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +55,7 @@ class Road:
         present: Keywords among `CHOSEN` that the file has, if they are neither shipped sets nor
             those of an earlier fit.
         assumed: Fields of the corridor that the file does not give.
-        seeds: Traffic seeds by kind, as `KINDS`.
+        seeds: Traffic seeds by kind, as `agents.seeds.KINDS`.
         decided: Keywords among these that neither the file nor the caller gives.
         remarks: What was decided for want of a word in the file, a sentence each.
     """
@@ -82,7 +74,7 @@ class Road:
     @property
     def inherited(self) -> str:
         """Name of the ARZ parameters that the environment has where nobody gives any."""
-        return str(PRESETS[_preset(self.env)].parameters)
+        return str(PRESETS[preset_of(self.env)].parameters)
 
     @property
     def all_seeds(self) -> tuple[int, ...]:
@@ -152,8 +144,8 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
         path: The road file.
         env: Id of the environment, or id and keywords as JSON (`agents.environments.parse_env`).
         folder: Where the fit goes; what the file has from there is no present choice.
-        seeds: Traffic seeds by kind, as `KINDS`, ``"first:stop"``; None for the usual number, or
-            all that were recorded.
+        seeds: Traffic seeds by kind, as `agents.seeds.KINDS`, ``"first:stop"``; None for the usual
+            number, or all that were recorded.
 
     Raises:
         ValueError: The file, a keyword or a seed is out of range, or the road cannot be fitted; the
@@ -172,7 +164,7 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
         present = {}
     keywords = {k: v for k, v in road.environment.items() if k not in (*CHOSEN, "traffic_seeds")}
     keywords |= given
-    base, decided, remarks = PRESETS[_preset(env)], list[str](), list[str]()
+    base, decided, remarks = PRESETS[preset_of(env)], list[str](), list[str]()
     third = max(corridor.n_mainline // 3, 1)
     if "bandwidth" not in keywords and third < base.bandwidth:
         keywords["bandwidth"] = third
@@ -187,17 +179,13 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
     found = _seeds_of(path, corridor, seeds)
     with quietly():
         more = {"corridor": str(path), "traffic_seeds": list(found["test"])}
-        config = resolve(_preset(env), {**keywords, **more})
+        config = resolve(preset_of(env), {**keywords, **more})
     longer = f"more than the {WARM_UP} s that do not count"
     require(config.horizon_steps > WARM_UP, f"{path}: duration", longer, config.horizon_steps)
     return Road(
         path, corridor, env, config, keywords, present, road.assumed, found, tuple(decided),
         tuple(remarks),
     )  # fmt: skip
-
-
-def _preset(env: str) -> str:
-    return str(gym.spec(env.rpartition(":")[2]).kwargs["preset"])
 
 
 def _lies_in(value: Any, folder: Path) -> bool:

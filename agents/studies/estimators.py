@@ -55,12 +55,12 @@ from agents.watchers import JUMP, LEVELS, REGIMES, SLOW
 PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
 SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = tuple(range(2000, 2064))
-EKF, WALK, LEARNED = "ekf", "random_walk", "recurrent"
+EKF, WALK, SMOOTHING, LEARNED = "ekf", "random_walk", "asm", "recurrent"
 ROUND_ROBIN = "round-robin"
 
 # ---- The first part: every vehicle answers. ----
 
-QUICK, SLOW_FILTERS = (EKF, WALK, "blend", LEARNED), ("ukf", "enkf", "mhe")
+QUICK, SLOW_FILTERS = (EKF, WALK, "blend", SMOOTHING, LEARNED), ("ukf", "enkf", "mhe")
 EVERYONE = (*QUICK, *SLOW_FILTERS)
 POLICIES = ("paper", ROUND_ROBIN, "oldest-first", "stale-variance", "largest-deviation")
 SHIPPED = "private-highway"
@@ -91,7 +91,7 @@ ELSEWHERE: dict[str, World] = {
 }
 """Worlds that differ from PrivateHighway-v1 in one thing, and ShortHighway-v0; other roads and
 drivers are in the study of roads."""
-MOVED = (EKF, WALK, LEARNED)
+MOVED = (EKF, WALK, SMOOTHING, LEARNED)
 MOVED_SEEDS = SEEDS[:24]
 
 
@@ -143,7 +143,7 @@ WORLD_CELLS = [
 RELEASES = ("paper", "corrected", "capped", "paced")
 GUARANTEED = ("capped", "paced")
 """Release models in which queries and detectors share a budget."""
-ESTIMATORS = (EKF, "ukf", "enkf", "mhe", LEARNED, WALK)
+ESTIMATORS = (EKF, "ukf", "enkf", "mhe", LEARNED, SMOOTHING, WALK)
 SHARES = {f"{percent} %": percent / 100 for percent in (1, 3, 10, 30, 100)}
 BASE_SHARE = 0.1
 UNKNOWN_SHARES = [0.02, 0.3]

@@ -83,7 +83,7 @@ LARGEST_FACTOR = 10.0
 
 
 class Stencil(NamedTuple):
-    """Where the J places of values are, S segments and then the ends, and how they count."""
+    """The J places of values, S segments and then the ends, and the weights that they have."""
 
     target: IntArray  # (Q,) segments that values count for, by place, then by delay
     wave: IntArray  # (Q,) FREE or JAM

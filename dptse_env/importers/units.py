@@ -29,7 +29,7 @@ LEAST_EXTENT = 0.75
 
 
 class Motion(NamedTuple):
-    """How the vehicles of a file move, in the units that are assumed.
+    """Motion of the vehicles of a file, in the units that are assumed.
 
     Attributes:
         step: Usual time between two points of a vehicle [s].
@@ -60,7 +60,7 @@ class Motion(NamedTuple):
 
     @property
     def is_usual(self) -> bool:
-        """Whether nothing tells that an assumed unit is wrong."""
+        """True if nothing tells that an assumed unit is wrong."""
         ratio = 1.0 if self.ratio is None else self.ratio
         slowest = SURE_SPEEDS[0] if self.ratio is None else SLOWEST_ROAD
         return (

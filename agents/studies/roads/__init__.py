@@ -43,7 +43,7 @@ from dptse_env.estimators.recurrent import member_for, shipped_networks
 from dptse_env.utils.files import file_digest
 
 OPENED = False
-"""Whether the roads that were kept back are played."""
+"""True once the roads that were kept back may be played."""
 
 PRIVATE, PAPER = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/PaperHighway-v0"
 LONG = "dptse_env:dptse/LongHighway-v0"
