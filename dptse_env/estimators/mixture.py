@@ -1,13 +1,16 @@
 """A mixture of estimators, weighed by how well each foretells what is released."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 
 from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
-from dptse_env.estimators.settings import EstimatorSettings
+from dptse_env.estimators.recurrent import Recurrent
+from dptse_env.estimators.settings import EstimatorSettings, RecurrentSettings
 from dptse_env.model import ARZModel
+from dptse_env.model.network import RoadNetwork
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 LEAST_VARIANCE = 1e-12
@@ -37,12 +40,10 @@ class Mixture(BatchEstimator):
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
-        from dptse_env.estimators import ESTIMATORS  # noqa: PLC0415 (which names this class)
-
         super().__init__(model, n_episodes, settings)
         self._fading = 1.0 - model.time_step / settings.mixture.memory
         self.experts: list[BatchEstimator] = [
-            ESTIMATORS.find(name)(model, n_episodes, settings) for name in settings.mixture.experts
+            kind(model, n_episodes, own) for kind, own in _experts(settings)
         ]
         self._likelihoods = np.zeros((len(self.experts), n_episodes))
         self._priors = np.zeros((n_episodes, 2 * model.n_segments))
@@ -51,10 +52,22 @@ class Mixture(BatchEstimator):
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
         """Refuse settings that an expert cannot have on the road."""
-        from dptse_env.estimators import check_settings  # noqa: PLC0415 (which names this class)
+        from dptse_env.estimators import check_settings  # noqa: PLC0415 (which names this module)
 
-        for name in settings.mixture.experts:
-            check_settings(name, model, settings)
+        for kind, own in _experts(settings):
+            check_settings(kind, model, own)
+
+    @staticmethod
+    def inherits(
+        network: RoadNetwork, flows: bool, largest_span: int, settings: EstimatorSettings
+    ) -> tuple[str, ...]:
+        """Return the setting of the experts where no network was trained on such roads."""
+        found = [
+            bool(kind.inherits(network, flows, largest_span, own))
+            for kind, own in _experts(settings)
+            if issubclass(kind, Recurrent)
+        ]
+        return ("estimator_settings.mixture.experts",) if found and all(found) else ()
 
     @property
     def weights(self) -> FloatArray:
@@ -125,3 +138,21 @@ class Mixture(BatchEstimator):
         means = (weights[:, None] * table[:, :2]).sum(axis=0)
         squares = table[:, 2:] ** 2 + (table[:, :2] - means) ** 2
         return Estimate(*means, *np.sqrt((weights[:, None] * squares).sum(axis=0)))
+
+
+def _experts(settings: EstimatorSettings) -> list[tuple[type[BatchEstimator], EstimatorSettings]]:
+    """Return the classes and settings of the experts; a name that is no estimator's is a network's.
+
+    Raises:
+        ValueError: An estimator cannot be found.
+    """
+    from dptse_env.estimators import ESTIMATORS  # noqa: PLC0415 (which names this module)
+
+    found: list[tuple[type[BatchEstimator], EstimatorSettings]] = []
+    for name in settings.mixture.experts:
+        if name in ESTIMATORS or ":" in name:
+            found.append((ESTIMATORS.find(name), settings))
+        else:
+            own = dataclasses.replace(settings, recurrent=RecurrentSettings(name))
+            found.append((Recurrent, own))
+    return found

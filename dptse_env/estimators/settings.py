@@ -139,11 +139,13 @@ class RecurrentSettings(_Checked, path=f"{_PATH}.recurrent"):
     Attributes:
         weights: Name of a network that ships with the package, or a file. A pair of networks, one
             for releases of flows and one for releases of speeds, goes by the name that they share:
-            ``highway`` stands for ``highway-flows`` or ``highway-speeds``. Outside of the ranges on
-            its card a network is used with a warning, and ``info["inherited"]`` names it.
+            ``roads`` stands for ``roads-flows`` or ``roads-speeds``. None takes ``highway`` or
+            ``long-highway`` on roads like those of the package, which they were trained on, and
+            ``roads`` on any other. Outside of the ranges on its card a network is used with a
+            warning, and ``info["inherited"]`` names it.
     """
 
-    weights: str = "highway"
+    weights: str | None = None
 
 
 @dataclass(frozen=True)
@@ -203,11 +205,12 @@ class MixtureSettings(_Checked, path=f"{_PATH}.mixture"):
     """Settings of the mixture.
 
     Attributes:
-        experts: Names of the estimators, two or more, which share all other settings.
+        experts: Two or more names of estimators or of recurrent networks (`RecurrentSettings`).
+            They share all other settings.
         memory: Seconds in which likelihoods are forgotten.
     """
 
-    experts: tuple[str, ...] = ("recurrent", "asm")
+    experts: tuple[str, ...] = ("highway", "roads")
     memory: Annotated[float, Interval(2, 3600)] = 60.0
 
     def __post_init__(self) -> None:
@@ -215,8 +218,8 @@ class MixtureSettings(_Checked, path=f"{_PATH}.mixture"):
         super().__post_init__()
         if len(self.experts) < 2 or "mixture" in self.experts:
             raise ValueError(
-                f"{_PATH}.mixture.experts must be two or more names of other estimators, "
-                f"got {shown(self.experts)}"
+                f"{_PATH}.mixture.experts must be two or more names of other estimators or of "
+                f"networks, got {shown(self.experts)}"
             )
 
 

@@ -72,7 +72,7 @@ def test_an_expert_that_is_wrong_loses_its_weight_and_gets_it_back():
 @pytest.mark.parametrize(
     ("experts", "message"),
     [
-        (("asm",), r"mixture\.experts must be two or more names of other estimators, got"),
+        (("asm",), r"mixture\.experts must be two or more names of other .*, got"),
         (("asm", "mixture"), r"mixture\.experts must be two or more names of other"),
     ],
 )
@@ -81,9 +81,15 @@ def test_experts_are_two_or_more_others(experts, message):
         mixing(*experts)
 
 
+def test_an_expert_is_an_estimator_or_a_network():
+    model = model_of("paper", "speed")
+    mixture = make_estimator("mixture", "compiled", model, 1, EstimatorSettings())
+    assert [each.saved.source for each in mixture.experts] == ["highway-speeds", "roads-speeds"]
+
+
 def test_settings_that_an_expert_cannot_have_are_refused():
     model = model_of("paper", "speed")
-    with pytest.raises(ValueError, match="estimator must be one of"):
+    with pytest.raises(ValueError, match=r"weights must be a file or one of .*, got 'kf'"):
         make_estimator("mixture", "compiled", model, 1, mixing("asm", "kf"))
     bad = replace(mixing("asm", "mhe"), process_noise=(0.0, 0.01))
     with pytest.raises(ValueError, match="process_noise"):
