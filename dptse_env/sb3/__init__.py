@@ -6,11 +6,12 @@ from dptse_env.utils.registry import needed_for
 with needed_for("dptse_env.sb3"):
     from dptse_env.sb3.road_policy import PlackettLuce, RoadChannels, RoadPolicy
     from dptse_env.sb3.saved import ActingPolicy, load_policy, save_policy
-    from dptse_env.sb3.vec_env import SB3VecEnv
+    from dptse_env.sb3.vec_env import ReplicaBaseline, SB3VecEnv
 
 __all__ = [
     "ActingPolicy",
     "PlackettLuce",
+    "ReplicaBaseline",
     "RoadChannels",
     "RoadPolicy",
     "SB3VecEnv",
