@@ -129,11 +129,7 @@ def _read_statistics(path: Path) -> Any:
 def _check_spaces(policy: Any, config: EnvConfig) -> None:
     """Refuse a model whose spaces are not those of the environment."""
     interface = make_interface(config)
-    for name, here in (
-        ("observation_space", interface.observations.space),
-        ("action_space", interface.actions.space),
-    ):
-        own = getattr(policy, name)
-        # VecNormalize and Monitor leave the bounds of observations open to change.
-        same = own.shape == here.shape if name == "observation_space" else own == here
-        require(same, f"model.{name}", f"{here} as in the environment", own)
+    own, here = policy.observation_space.shape, interface.observations.space.shape
+    require(own == here, "model.observation_space", f"of shape {here} as the environment's", own)
+    actions, there = policy.action_space, interface.actions.space
+    require(actions == there, "model.action_space", f"{there} as the environment's", actions)

