@@ -17,9 +17,7 @@ TUNING = range(1_000_000, 2_000_000)
 CHOICE = range(2_000_000, 3_000_000)
 """The choice of parameters, estimator and query rule for a road, on validation traffic."""
 TRAINING_VALIDATION = range(4_000_000, 5_000_000)
-"""The learning curve of a training, by which its best policy is kept."""
-STUDY_VALIDATION = range(5_000_000, 6_000_000)
-"""The choice of the best baseline and the best recipe in the study of policies."""
+"""The learning curve of a training, by which its best policy is kept, and the rules beside it."""
 STUDY_TEST = range(6_000_000, 7_000_000)
 """The test results of the study of policies."""
 SUITE = range(7_000_000, 8_000_000)

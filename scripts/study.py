@@ -47,8 +47,10 @@ class Args(Machines):
     env: tuple[str, ...] = ()
     """Environments, 'ID {"corridor": "my-road.toml"}': only cells of these ids are played, and
     with these keywords; needs another output."""
-    policies: tuple[str, ...] = ()
-    """Trained policies for the study of policies, each name=path."""
+    train: float | None = None
+    """Minutes of each training of the study of policies, which trains what is missing first."""
+    training_seeds: str = "0:5"
+    """Seeds of these trainings, first:stop: every learner has the first, the best two all."""
     weights: tuple[str, ...] = ()
     """Networks for the study of roads, in place of the shipped one, or of estimators, beside it:
     names, or paths without "-flows.safetensors" and "-speeds.safetensors"; need another output."""
@@ -62,17 +64,13 @@ def find_study(args: Args) -> Study:
     Raises:
         ValueError: There is no such study, or an argument is of another one.
     """
-    for argument, names in (("policies", ("policies",)), ("weights", ("estimators", "roads"))):
+    for argument, names in (("train", ("policies",)), ("weights", ("estimators", "roads"))):
         if getattr(args, argument) and args.name not in names:
             raise ValueError(
-                f"{argument} are arguments of the study {' or '.join(names)}, not of {args.name!r}"
+                f"{argument} is an argument of the study {' or '.join(names)}, not of {args.name!r}"
             )
-    if args.policies:
-        from agents.studies.policies import study as with_policies  # noqa: PLC0415
-
-        found = with_policies(args.policies)
-    elif args.weights:
-        found = importlib.import_module(f"agents.studies.{args.name}").study(args.weights)
+    if args.weights:
+        found: Study = importlib.import_module(f"agents.studies.{args.name}").study(args.weights)
     elif args.name in STUDIES:
         found = importlib.import_module(f"agents.studies.{args.name}").STUDY
     elif ":" in args.name:
@@ -141,6 +139,12 @@ def main(args: Args) -> None:
         )
     if args.report:
         write_report(study, folder)
-    else:
-        run_study(study, args.place(folder))
+        print(f"tables and figures are in {folder}/")
+        return
+    place = args.place(folder)
+    if args.train is not None:
+        from agents.studies.policies.trainings import train_ladder  # noqa: PLC0415 (needs torch)
+
+        train_ladder(study, place, args.train, parse_seeds(args.training_seeds, "training_seeds"))
+    run_study(study, place)
     print(f"tables and figures are in {folder}/")

@@ -1,0 +1,502 @@
+"""A ladder of algorithms: which policy errs least, and how much of what can be won does it win?
+
+In each setting rules and oracles play, and policies that algorithms of ``dptse train`` have trained
+for the same time. Validation traffic chooses the best rule, the checkpoint and the mode of every
+training, and the learners that get further training seeds. Then all play test traffic, once.
+
+``--train MINUTES`` trains what is missing, in ``trainings/SETTING/LEARNER/SEED`` of the output:
+every learner with the first of ``--training-seeds``, the best two of a setting with the others. The
+same command goes on after a kill. The report needs the rows and ``curves.parquet`` alone.
+
+dptse study policies --train 10 --training-seeds 0:5 --workers 2
+dptse study policies --report
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from itertools import chain, product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import polars as pl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from agents.figures import (
+    GREY,
+    LABELS,
+    Look,
+    draw_curve,
+    draw_dot,
+    finish_figure,
+    make_figure,
+    save_figure,
+    set_log_ticks,
+    shifted,
+)
+from agents.play import Cell
+from agents.seeds import STUDY_TEST, TRAINING_VALIDATION
+from agents.statistics import Interval, bootstrap, interquartile_mean, percent_below, percent_of_way
+from agents.study import Study, read_table
+from agents.tables import (
+    ERROR,
+    Labels,
+    UnmeasuredError,
+    grid,
+    pick_paired,
+    tenths,
+    values,
+    values_of,
+)
+from dptse_env.config import parse_seeds
+from dptse_env.utils.arrays import FloatArray
+
+Statistic = Callable[..., FloatArray]
+
+# What is played: rules, oracles and learned policies in settings.
+
+SHORT, PRIVATE = "dptse_env:dptse/ShortHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
+LONG, PAPER = "dptse_env:dptse/LongHighway-v0", "dptse_env:dptse/PaperHighway-v0"
+ROUND_ROBIN, ORACLE, GAIN = "round-robin", "oracle-error", "oracle-gain"
+RULES = (
+    ROUND_ROBIN, "paper", "oldest-first", "largest-variance", "stale-variance",
+    "largest-deviation", "speed-front", "expected-reduction",
+)  # fmt: skip
+"""Policies that need no training; "paper" is the paper's schedule."""
+PLACKETT_LUCE, STARTED = "plackett-luce", "ppo-from-plackett-luce"
+LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "ppo-perceptron": ("ppo", {"policy": "mlp"}),
+    "ppo-road": ("ppo", {}),
+    "maskable-ppo": ("maskable-ppo", {}),
+    "recurrent-ppo": ("recurrent-ppo", {}),
+    "qr-dqn": ("qr-dqn", {}),
+    PLACKETT_LUCE: (PLACKETT_LUCE, {}),
+    STARTED: ("ppo", {}),
+}
+"""Algorithms of ``dptse train``, with what differs from their tuned settings. `STARTED` has half of
+its time for Plackett-Luce, from whose best policy PPO starts."""
+VALIDATION, TEST = "validation", "test"
+"""Parts of the study, in the column ``part`` of its rows."""
+
+
+class Traffic(NamedTuple):
+    """Traffic seeds of a setting. The oracle that tries every segment may have fewer."""
+
+    training: tuple[int, ...]
+    validation: tuple[int, ...]
+    test: tuple[int, ...]
+    gain: tuple[int, ...]
+
+
+TRAFFIC = Traffic(*map(parse_seeds, ("0:128", "1000:1024", "2200:2264", "2200:2264")))
+LONG_TRAFFIC = Traffic(*map(parse_seeds, ("0:48", "1000:1008", "2200:2216", "2200:2204")))
+LONG_CHANGES: dict[str, dict[str, Any]] = {
+    **{name: {"validations": 12} for name, _ in LEARNERS.values()},
+    PLACKETT_LUCE: {
+        "n_envs": 16, "regression": {"batch_size": 128},
+        "swaps": {"episodes": 60, "batch_size": 128},
+    },
+}  # fmt: skip
+"""Settings by algorithm for 120 segments: fewer validations, which take long, and fewer samples for
+Plackett-Luce, to which every segment is one."""
+
+
+class Setting(NamedTuple):
+    """An environment in which policies are compared.
+
+    Attributes:
+        description: What it is, in tables.
+        env: Environment id.
+        keywords: Keywords of the environment.
+        regression: Time that the regression of Plackett-Luce takes on one core [min].
+        swaps: Time that one of its rounds of swaps takes on one core [min].
+        traffic: Traffic seeds.
+        changes: What differs from tuned settings, by algorithm.
+    """
+
+    description: str
+    env: str
+    keywords: Mapping[str, Any]
+    regression: float
+    swaps: float
+    traffic: Traffic = TRAFFIC
+    changes: Mapping[str, Mapping[str, Any]] = {}
+
+
+_ONE, _TWO = ({"estimator": "ekf", "bandwidth": bandwidth} for bandwidth in (1, 2))
+_PACED: dict[str, Any] = {"privacy": {"preset": "paced", "epsilon": 5.0}}
+_RECURRENT: dict[str, Any] = {"estimator": "recurrent", "bandwidth": 2}
+_FIVE: dict[str, Any] = {"estimator": "ekf", "bandwidth": 5, "privacy": "capped"}
+SETTINGS = {
+    "short": Setting("ShortHighway-v0, B = 1", SHORT, _ONE, 1.0, 0.5),
+    "short-paced": Setting("ShortHighway-v0, paced, B = 1", SHORT, _ONE | _PACED, 1.0, 0.5),
+    "private-1": Setting("PrivateHighway-v1, B = 1", PRIVATE, _ONE, 1.5, 1.0),
+    "private-2": Setting("PrivateHighway-v1, B = 2", PRIVATE, _TWO, 1.5, 1.0),
+    "long": Setting("LongHighway-v0, B = 2", LONG, _TWO, 2.0, 1.0, LONG_TRAFFIC, LONG_CHANGES),
+    "long-recurrent": Setting(
+        "LongHighway-v0, recurrent, B = 2", LONG, _RECURRENT, 2.0, 1.0, LONG_TRAFFIC, LONG_CHANGES
+    ),
+    "paper": Setting("PaperHighway-v0, capped, B = 5", PAPER, _FIVE, 1.5, 1.0),
+}
+CURVES = "curves.parquet"
+"""Learning curves of the trainings that are finished, a line for each validation, with the digest
+of the best policy."""
+
+
+def training_folder(study: Path, setting: str, learner: str, seed: int) -> Path:
+    """Return the folder of a training in that of the study."""
+    return study / "trainings" / setting / learner / str(seed)
+
+
+def played(setting: str, policy: str, part: str = TEST) -> Labels:
+    """Return the labels of a policy in a setting; a learner has several training seeds."""
+    return {"part": part, "setting": setting, "policy": policy}
+
+
+def _cell(
+    name: str, policy: str, part: str, seed: int = -1, digest: str = "", file: str = ""
+) -> Cell:
+    setting, traffic = SETTINGS[name], SETTINGS[name].traffic
+    seeds = traffic.gain if policy == GAIN else traffic.test
+    return Cell(
+        env=setting.env,
+        policy=file or policy,
+        keywords=setting.keywords,
+        labels={**played(name, policy, part), "training_seed": seed, "digest": digest},
+        noise_seed=(STUDY_TEST if part == TEST else TRAINING_VALIDATION).start,
+        seeds=seeds if part == TEST else traffic.validation,
+    )
+
+
+def test_cells(rows: pl.DataFrame, folder: Path) -> list[Cell]:
+    """Return rules, oracles, and the best policies of the trainings that are there and finished."""
+    del rows  # choices among these are the report's
+    cells = [_cell(*each, TEST) for each in product(SETTINGS, (*RULES, ORACLE, GAIN))]
+    trained = read_curves(folder).select("setting", "policy", "training_seed", "digest").unique()
+    for setting, learner, seed, digest in trained.sort(pl.all()).iter_rows():
+        file = training_folder(folder, setting, learner, seed) / "best.safetensors"
+        if setting in SETTINGS and file.exists():
+            cells.append(_cell(setting, learner, TEST, seed, digest, file=str(file)))
+    return cells
+
+
+# What is measured: tables of training seeds by traffic seeds.
+
+
+def tables(rows: pl.DataFrame, metric: str, *groups: Labels) -> list[FloatArray]:
+    """Return a column of groups of cells, paired by traffic as `pick_paired` does.
+
+    A group has the cells of all training seeds.
+
+    Returns:
+        For each group an array (n_training_seeds, n_traffic_seeds).
+
+    Raises:
+        UnmeasuredError: No version has played all on two traffic seeds.
+        ValueError: Two cells have the same labels and training seed.
+    """
+    cells = []
+    for labels in groups:
+        seeds = rows.filter(**labels)["training_seed"].unique().sort()
+        if seeds.is_empty():
+            raise UnmeasuredError(dict(labels))
+        cells.append([{**labels, "training_seed": seed} for seed in seeds])
+    found = iter(pick_paired(rows, *chain.from_iterable(cells)))
+    return [np.stack([values_of(next(found), metric) for _ in own]) for own in cells]
+
+
+def measure(rows: pl.DataFrame, statistic: Statistic, *groups: Labels) -> Interval:
+    """Return a statistic of the errors of groups, by training seeds crossed with traffic."""
+    return bootstrap(statistic, *tables(rows, ERROR, *groups))
+
+
+def read_curves(folder: Path) -> pl.DataFrame:
+    """Return the learning curves of a folder, none where nothing was trained.
+
+    Raises:
+        ValueError: Their file is damaged.
+    """
+    columns = {
+        "setting": pl.String, "policy": pl.String, "training_seed": pl.Int64,
+        "digest": pl.String, "steps": pl.Int64, "seconds": pl.Float64,
+        "validation": pl.Float64, "validation_drawn": pl.Float64,
+    }  # fmt: skip
+    path = folder / CURVES
+    curves = read_table(path, tuple(columns)) if path.exists() else pl.DataFrame(schema=columns)
+    return curves.with_columns(error=1000.0 * pl.min_horizontal("validation", "validation_drawn"))
+
+
+def best_rule(rows: pl.DataFrame, setting: str) -> str:
+    """Return the rule of least error on validation traffic.
+
+    Raises:
+        UnmeasuredError: A rule was not played there.
+    """
+    return min(RULES, key=lambda rule: validation_error(rows, setting, rule))
+
+
+def validation_error(rows: pl.DataFrame, setting: str, rule: str) -> float:
+    """Return the error x 1000 of a rule on validation traffic.
+
+    Raises:
+        UnmeasuredError: It was not played there.
+    """
+    return float(values(rows, played(setting, rule, VALIDATION), ERROR).mean())
+
+
+def ranked_learners(curves: pl.DataFrame, setting: str, seed: int | None = None) -> list[str]:
+    """Return the learners of a setting, the least error on validation traffic first.
+
+    Args:
+        curves: Learning curves.
+        setting: Key of `SETTINGS`.
+        seed: Training seed by which they are compared; if None, those with the most training seeds
+            are, by the mean of these.
+    """
+    own = curves.filter(setting=setting)
+    if seed is not None:
+        own = own.filter(training_seed=seed)
+    least = own.group_by("policy", "training_seed").agg(pl.min("error"))
+    found = least.group_by("policy").agg(pl.mean("error"), n=pl.len())
+    found = found.filter(pl.col("n") == pl.max("n")).sort("error", "policy")
+    return list(found["policy"])
+
+
+# What is reported: the settings.
+
+BELOW, WAY = "below the best rule [%]", f"way from {ROUND_ROBIN} to {GAIN} [%]"
+
+
+def compared(rows: pl.DataFrame, setting: str, policy: str, column: str) -> Interval:
+    """Return `BELOW` or `WAY` of a policy in a setting."""
+    statistic: Statistic = percent_below if column == BELOW else percent_of_way
+    others = (best_rule(rows, setting),) if column == BELOW else (ROUND_ROBIN, GAIN)
+    return measure(rows, statistic, *(played(setting, each) for each in (policy, *others)))
+
+
+def summary_table(rows: pl.DataFrame, curves: pl.DataFrame) -> str:
+    """Return what is to be won in each setting, and what the best learner wins."""
+
+    def learner(name: str) -> str:
+        found = ranked_learners(curves, name)
+        if not found:
+            raise UnmeasuredError(name)
+        return found[0]
+
+    def entry(name: str, column: str) -> str:
+        if column == "learner":
+            return learner(name)
+        if column == "file":
+            own = curves.filter(setting=name, policy=learner(name)).sort("error", "training_seed")
+            folder = training_folder(Path(), name, learner(name), own["training_seed"][0])
+            return f"`{folder.as_posix()}`"
+        if column in (BELOW, WAY):
+            return tenths(compared(rows, name, learner(name), column))
+        rule = best_rule(rows, name)
+        error = measure(
+            rows, interquartile_mean, played(name, rule if column == "best rule" else column)
+        )
+        return f"{error.mean:.1f}" + (f" (`{rule}`)" if column == "best rule" else "")
+
+    columns = (ROUND_ROBIN, "best rule", ORACLE, GAIN, "learner", BELOW, WAY, "file")
+    return grid("setting", list(SETTINGS), columns, entry)
+
+
+def setting_table(rows: pl.DataFrame, curves: pl.DataFrame, setting: str) -> str:
+    """Return all policies that played test traffic in a setting, the least error first."""
+    own = rows.filter(part=TEST, setting=setting)
+    errors = {
+        policy: measure(rows, interquartile_mean, played(setting, policy))
+        for policy in own["policy"].unique()
+    }
+
+    def entry(policy: str, column: str) -> str:
+        if column == "error x 1000":
+            return tenths(errors[policy])
+        if column in (BELOW, WAY):
+            return tenths(compared(rows, setting, policy, column))
+        trained = curves.filter(setting=setting, policy=policy)
+        if trained.is_empty():
+            raise UnmeasuredError(policy)
+        if column == "training seeds":
+            return str(trained["training_seed"].n_unique())
+        steps = trained.group_by("training_seed").agg(pl.max("steps"))["steps"].to_numpy()
+        return f"{steps.mean() / 1e6:.2f}"
+
+    columns = ("error x 1000", BELOW, WAY, "training seeds", "steps trained [10⁶]")
+    return grid("policy", sorted(errors, key=lambda each: errors[each].mean), columns, entry)
+
+
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b9770e", "#56b4e9", "#7d5ba6")
+
+
+def _panels(titles: Iterable[str], label: str = "", **options: Any) -> tuple[Figure, list[Axes]]:
+    """Return a figure of up to eight panels with titles; ``label`` is that of their left edge."""
+    figure, named = make_figure(11.0, 5.8, dpi=120), list(titles)
+    axes = list(figure.subplots(2, 4, **options).ravel())
+    for axis in axes[len(named) :]:
+        axis.remove()
+    for axis, title in zip(axes, named, strict=False):
+        axis.set_title(title, fontsize=9)
+    for axis in axes[::4]:
+        axis.set_ylabel(label, fontsize=8)
+    return figure, axes[: len(named)]
+
+
+def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
+    """Draw errors in validation over the time of training, with rules as lines."""
+    figure, axes = _panels((each.description for each in SETTINGS.values()), "error x 1000")
+    for axis, name in zip(axes, SETTINGS, strict=True):
+        highest = 0.0
+        for rule, line in ((ROUND_ROBIN, ":"), (best_rule(rows, name), "--")):
+            error = validation_error(rows, name, rule)
+            highest = max(highest, error)
+            axis.axhline(error, color=GREY, linestyle=line, linewidth=0.9)
+            axis.annotate(
+                rule, (1.0, error), xycoords=("axes fraction", "data"), fontsize=7, ha="right",
+                va="bottom",
+            )  # fmt: skip
+        for learner, colour in zip(LEARNERS, _COLOURS, strict=True):
+            own = curves.filter(setting=name, policy=learner).sort("training_seed", "seconds")
+            for _, each in own.group_by("training_seed", maintain_order=True):
+                minutes = each["seconds"] / 60.0
+                axis.plot(minutes, each["error"], color=colour, linewidth=0.9, label=learner)
+        # What is not trained yet may err far more than any rule.
+        axis.set_ylim(top=1.03 * highest)
+        axis.set_xlabel("minutes", fontsize=8)
+    save_figure(finish_figure(figure, columns=7), path, "Errors on validation traffic")
+
+
+def draw_below(rows: pl.DataFrame, path: Path) -> None:
+    """Draw how far learners and oracles lie below the best rule of each setting."""
+    shown = (*LEARNERS, ORACLE, GAIN)
+    figure, axes = _panels((each.description for each in SETTINGS.values()), sharey=True)
+    for axis, name in zip(axes, SETTINGS, strict=True):
+        for place, policy in enumerate(shown):
+            try:
+                below = compared(rows, name, policy, BELOW)
+            except UnmeasuredError:
+                continue
+            colour = _COLOURS[0] if policy in LEARNERS else GREY
+            draw_dot(axis, below, -place, colour, "learners" if policy in LEARNERS else "oracles")
+        axis.axvline(0.0, color=GREY, linewidth=0.8)
+        axis.margins(x=0.2)
+        axis.set_yticks([-place for place in range(len(shown))], shown)
+        axis.set_xlabel("below the best rule [%]", fontsize=8)
+    title = "Errors below the best rule's; 95 % intervals"
+    save_figure(finish_figure(figure), path, title)
+
+
+# What is reported: recorded gains over a round robin, by the share of the road that is queried.
+
+CHOICES, LEARNED = "choices", "learned"
+HIGHWAY = "highway"
+N_SEGMENTS = {HIGHWAY: 15, "long": 120}
+BANDWIDTHS = {HIGHWAY: (1, 2, 3, 5, 8, 12), "long": (2, 4, 8, 24)}
+
+
+class World(NamedTuple):
+    """The subject of a curve over bandwidths."""
+
+    road: str
+    release: str
+    estimator: str
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        n = N_SEGMENTS[self.road]
+        return f"{n} segments, {self.release}, {LABELS[self.estimator]}"
+
+    @property
+    def rule(self) -> str:
+        """The rule for its estimator, chosen on other traffic."""
+        return "speed-front" if self.estimator == "ekf" else "expected-reduction"
+
+    def gain(self, rows: pl.DataFrame, bandwidth: int, policy: str) -> Interval:
+        """Return how far a policy lies below the round robin [%]."""
+        place = {
+            "part": CHOICES, **self._asdict(), "bandwidth": bandwidth, "traffic": "own",
+            "epsilon": 5.0, "span": 1,
+        }  # fmt: skip
+        both = ({**place, "policy": each} for each in (policy, ROUND_ROBIN))
+        return measure(rows, percent_below, *both)
+
+
+WORLDS = (
+    *(World(HIGHWAY, *each) for each in product(("paced", "capped"), ("ekf", "recurrent"))),
+    World("long", "paced", "ekf"),
+    World("long", "paced", "recurrent"),
+    World("long", "capped", "recurrent"),
+)
+LOOKS = {
+    "rule": Look("#0072b2", "o"),
+    ORACLE: Look("#666666", "^", ":"),
+    GAIN: Look("#333333", "v", "--"),
+    LEARNED: Look("#d55e00", "s"),
+}
+
+
+def gain_table(rows: pl.DataFrame, world: World) -> str:
+    """Return the gains over the round robin in a world, by bandwidth [%]."""
+
+    def entry(bandwidth: int, column: str) -> str:
+        return tenths(world.gain(rows, bandwidth, world.rule if column == "rule" else column))
+
+    return grid(f"B, rule `{world.rule}`", BANDWIDTHS[world.road], list(LOOKS), entry)
+
+
+def draw_gains(rows: pl.DataFrame, path: Path) -> None:
+    """Draw gains over the round robin against the share of the road that is queried."""
+    label = f"error below {ROUND_ROBIN} [%]"
+    figure, axes = _panels((each.name for each in WORLDS), label, sharey=True)
+    for axis, world in zip(axes, WORLDS, strict=True):
+        bandwidths = BANDWIDTHS[world.road]
+        shares = [100.0 * each / N_SEGMENTS[world.road] for each in bandwidths]
+        for k, (label, look) in enumerate(LOOKS.items()):
+            policy = world.rule if label == "rule" else label
+            try:
+                found = [world.gain(rows, each, policy) for each in bandwidths]
+            except UnmeasuredError:
+                continue
+            draw_curve(axis, shifted(shares, 0.01 * (k - 1), log=True), found, look, label)
+        axis.axhline(0.0, color=GREY, linewidth=0.8)
+        axis.set_xscale("log")
+        set_log_ticks(axis.xaxis, [round(share, 1) for share in shares])
+        axis.set_xlabel("segments queried a second [%]", fontsize=8)
+    title = f"Gain of choosing queries over {ROUND_ROBIN}; 95 % intervals"
+    save_figure(finish_figure(figure, columns=4), path, title)
+
+
+def report(rows: pl.DataFrame, folder: Path) -> str:
+    """Return the tables, and draw the figures."""
+    curves = read_curves(folder)
+    named = {*played("", ""), "training_seed", "digest"} - set(rows.columns)
+    rows = rows.with_columns(pl.lit(None).alias(name) for name in sorted(named))
+    # A training that was begun anew has left rows of the policy that it had before.
+    present = ["", *curves["digest"].unique()]
+    rows = rows.filter(pl.col("digest").cast(pl.String).fill_null("").is_in(present))
+    parts = ["# Query policies"]
+    if not rows.filter(part=TEST).is_empty():
+        parts += ["## Summary", summary_table(rows, curves)]
+        for name, setting in SETTINGS.items():
+            parts += [f"## {name}: {setting.description}", setting_table(rows, curves, name)]
+        draw_curves(rows, curves, folder / "fig_curves.png")
+        draw_below(rows, folder / "fig_below.png")
+    if not rows.filter(part=CHOICES).is_empty():
+        parts.append(f"## Gains over {ROUND_ROBIN} by bandwidth [%]")
+        for world in WORLDS:
+            parts += [f"### {world.name}", gain_table(rows, world)]
+        draw_gains(rows, folder / "fig_gains.png")
+    return "\n\n".join(parts)
+
+
+STUDY = Study(
+    "policies",
+    tuple(_cell(*each, VALIDATION) for each in product(SETTINGS, RULES)),
+    TRAFFIC.test,
+    report,
+    test_cells,
+)
