@@ -112,7 +112,8 @@ def bootstrap(
     seeds with replacement, separately for each table (the "pigeonhole bootstrap" of Owen, 2007).
     The interval lies between the percentiles of the statistic over the resamples. Its coverage is
     nominal where runs differ little on each traffic seed. With five runs that differ by much more
-    than the standard error of their means over traffic, a nominal 95 % covers some 84 %.
+    than the standard error of their means over traffic, a nominal 95 % covers some 89 %
+    of interquartile means.
 
     Args:
         statistic: Takes arrays (r, S, T), one for each table, and returns (r,).

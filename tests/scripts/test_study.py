@@ -33,8 +33,10 @@ def test_every_study_is_found_and_a_cell_has_one_set_of_labels(name):
         ({"name": "moon"}, "study must be one of paper, guarantees, .*, got 'moon'"),
         ({"name": "no_such_module:STUDY"}, "'no_such_module:STUDY' cannot be imported"),
         ({"name": "examples.my_study:CELLS"}, "must be a Study, got tuple"),
-        ({"name": MINE, "policies": ("a=b.zip",)}, "policies are arguments of the study policies"),
-        ({"name": "paper", "weights": ("a",)}, "weights are arguments of the study estim"),
+        ({"name": MINE, "train": 1.0}, "train is an argument of the study policies, not of"),
+        ({"name": "policies", "train": 0.0}, "train must be a number > 0"),
+        ({"name": "policies", "train": 1.0, "training_seeds": "5"}, "x"),
+        ({"name": "paper", "weights": ("a",)}, "weights is an argument of the study estim"),
         ({"name": MINE, "seeds": "all"}, "must be 'first:stop' or one seed, got 'all'"),
         ({"name": MINE, "workers": 0}, "workers must be an integer >= 1"),
     ],
@@ -76,10 +78,11 @@ def test_seeds_and_environments_can_be_others_with_an_output_of_their_own():
     assert (study.seeds, study.measures) == ((2900, 2901), {})
 
 
-def test_choices_keep_their_validation_traffic_on_other_seeds():
+def test_choices_keep_their_validation_traffic_on_other_seeds(tmp_path):
     study = find_study(Args(name="policies", seeds="2900:2902", quick=True))
-    seeds = {cell.labels["part"]: study.seeds_of(cell) for cell in study.cells}
-    assert seeds == {"validation": (1000, 1001, 1002), "choices": (2900, 2901)}
+    cells = [*study.cells, *study.follow(pl.DataFrame(), tmp_path)]
+    seeds = {cell.labels["part"]: study.seeds_of(cell) for cell in cells}
+    assert seeds == {"validation": (1000, 1001, 1002), "test": (2900, 2901)}
 
 
 @pytest.mark.slow

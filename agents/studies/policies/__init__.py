@@ -91,7 +91,7 @@ class Traffic(NamedTuple):
 
 
 TRAFFIC = Traffic(*map(parse_seeds, ("0:128", "1000:1024", "2200:2264", "2200:2264")))
-LONG_TRAFFIC = Traffic(*map(parse_seeds, ("0:48", "1000:1008", "2200:2216", "2200:2204")))
+LONG_TRAFFIC = Traffic(*map(parse_seeds, ("0:48", "1000:1008", "2200:2216", "2200:2208")))
 LONG_CHANGES: dict[str, dict[str, Any]] = {
     **{name: {"validations": 12} for name, _ in LEARNERS.values()},
     PLACKETT_LUCE: {
@@ -128,7 +128,7 @@ class Setting(NamedTuple):
 _ONE, _TWO = ({"estimator": "ekf", "bandwidth": bandwidth} for bandwidth in (1, 2))
 _PACED: dict[str, Any] = {"privacy": {"preset": "paced", "epsilon": 5.0}}
 _RECURRENT: dict[str, Any] = {"estimator": "recurrent", "bandwidth": 2}
-_FIVE: dict[str, Any] = {"estimator": "ekf", "bandwidth": 5, "privacy": "capped"}
+_CAPPED: dict[str, Any] = {"bandwidth": 5, "privacy": {"preset": "capped", "epsilon": 5.0}}
 SETTINGS = {
     "short": Setting("ShortHighway-v0, B = 1", SHORT, _ONE, 1.0, 0.5),
     "short-paced": Setting("ShortHighway-v0, paced, B = 1", SHORT, _ONE | _PACED, 1.0, 0.5),
@@ -138,7 +138,7 @@ SETTINGS = {
     "long-recurrent": Setting(
         "LongHighway-v0, recurrent, B = 2", LONG, _RECURRENT, 2.0, 1.0, LONG_TRAFFIC, LONG_CHANGES
     ),
-    "paper": Setting("PaperHighway-v0, capped, B = 5", PAPER, _FIVE, 1.5, 1.0),
+    "paper": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED, 1.5, 1.0),
 }
 CURVES = "curves.parquet"
 """Learning curves of the trainings that are finished, a line for each validation, with the digest
@@ -349,22 +349,24 @@ def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
     """Draw errors in validation over the time of training, with rules as lines."""
     figure, axes = _panels((each.description for each in SETTINGS.values()), "error x 1000")
     for axis, name in zip(axes, SETTINGS, strict=True):
-        highest = 0.0
-        for rule, line in ((ROUND_ROBIN, ":"), (best_rule(rows, name), "--")):
-            error = validation_error(rows, name, rule)
-            highest = max(highest, error)
-            axis.axhline(error, color=GREY, linestyle=line, linewidth=0.9)
+        try:
+            named = (ROUND_ROBIN, best_rule(rows, name))
+            shown = {rule: validation_error(rows, name, rule) for rule in named}
+        except UnmeasuredError:
+            continue
+        for rule, error in shown.items():
+            axis.axhline(error, color=GREY, linestyle="--", linewidth=0.9)
             axis.annotate(
                 rule, (1.0, error), xycoords=("axes fraction", "data"), fontsize=7, ha="right",
                 va="bottom",
             )  # fmt: skip
-        for learner, colour in zip(LEARNERS, _COLOURS, strict=True):
+        for learner, colour in zip(LEARNERS, _COLOURS, strict=False):
             own = curves.filter(setting=name, policy=learner).sort("training_seed", "seconds")
             for _, each in own.group_by("training_seed", maintain_order=True):
                 minutes = each["seconds"] / 60.0
                 axis.plot(minutes, each["error"], color=colour, linewidth=0.9, label=learner)
         # What is not trained yet may err far more than any rule.
-        axis.set_ylim(top=1.03 * highest)
+        axis.set_ylim(top=1.03 * max(shown.values()))
         axis.set_xlabel("minutes", fontsize=8)
     save_figure(finish_figure(figure, columns=7), path, "Errors on validation traffic")
 

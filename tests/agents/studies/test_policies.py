@@ -1,127 +1,230 @@
-import json
+import shutil
+from itertools import product
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 
 from agents.executors import THIS_PROCESS
-from agents.statistics import bootstrap, percent_below
+from agents.statistics import bootstrap, percent_below, percent_of_way
 from agents.studies import policies
-from agents.study import Place, read_rows, run, write_report, write_table
-from dptse_env.config import VALIDATION_SEEDS
-from tests.helpers import SHORT, save_untrained
+from agents.studies.policies import GAIN, ORACLE, ROUND_ROBIN, RULES, STARTED, TEST, VALIDATION
+from agents.studies.policies.trainings import START, Training, fits, plan_of, train_ladder
+from agents.study import Place, read_rows, read_table, run, write_report, write_table
+from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
+from tests.agents.training.plans import SMALL
+from tests.helpers import SHORT
 
 RECORDED = Path(__file__).parents[3] / "results" / "policies"
-VALIDATION, TEST, PRIMARY = policies.VALIDATION, policies.TEST, policies.PRIMARY
+BEST, OTHER = "speed-front", "paper"
 
 
-@pytest.fixture(scope="module")
-def recorded():
-    if not RECORDED.is_dir():
-        pytest.skip("a source archive has no results")
-    return read_rows("policies", RECORDED)
+def rows_of(policy, errors, part=TEST, setting="short", seed=-1, digest=""):
+    """Return rows of a cell with the given errors x 1000 on traffic from 2200 on."""
+    same = {
+        "study": "policies", "version": "0.1.0", "cell": f"{part} {setting} {policy} {seed} {digest}",
+        "part": part, "setting": setting, "policy": policy, "training_seed": seed, "digest": digest,
+    }  # fmt: skip
+    return [
+        {**same, "traffic_seed": 2200 + k, "reward": -error / 1000}
+        for k, error in enumerate(errors)
+    ]
 
 
-def errors(rows, **labels):
-    """Return errors x 1000, training seeds by traffic seeds."""
-    found = rows.filter(**labels).sort("training_seed", "traffic_seed")
-    return -1000.0 * found["reward"].to_numpy().reshape(-1, found["traffic_seed"].n_unique())
+def curve_of(policy, errors, seed=0, digest="", setting="short", steps=5e5):
+    """Return a learning curve: errors x 1000 of the likeliest actions; drawn ones err by 5 more."""
+    return [
+        {
+            "setting": setting, "policy": policy, "training_seed": seed, "digest": digest,
+            "steps": int(steps * k), "seconds": 60.0 * k,
+            "validation": error / 1000, "validation_drawn": (error + 5) / 1000,
+        }
+        for k, error in enumerate(errors)
+    ]  # fmt: skip
+
+
+@pytest.fixture
+def errors():
+    """Errors on test traffic by policy, training seeds by traffic."""
+    generator = np.random.default_rng(0)
+    traffic = 100.0 + 10.0 * generator.standard_normal(12)
+    factors = {
+        ROUND_ROBIN: 1.1, BEST: 1.0, OTHER: 0.99, ORACLE: 0.85, GAIN: 0.8, "ppo-road": 0.9,
+        "qr-dqn": 1.02,
+    }  # fmt: skip
+    found = {}
+    for policy, factor in factors.items():
+        n = 5 if policy == "ppo-road" else 1
+        found[policy] = factor * traffic + generator.standard_normal((n, 12))
+    found["ppo-road"][3] = 150.0  # a training that failed
+    return found
+
+
+@pytest.fixture
+def ladder(errors, tmp_path):
+    """The folder of a study of one setting."""
+    rows = [
+        row
+        for policy, table in errors.items()
+        for seed, values in enumerate(table)
+        for row in rows_of(
+            policy, values, seed=seed if policy in policies.LEARNERS else -1,
+            digest=f"{policy}{seed}" if policy in policies.LEARNERS else "",
+        )
+    ]  # fmt: skip
+    for rule in RULES:
+        rows += rows_of(rule, [90.0 if rule == BEST else 95.0] * 2, VALIDATION)
+    rows += rows_of("ppo-road", np.zeros(12), seed=0, digest="of a training begun anew")
+    write_table(tmp_path / "rows.parquet", pl.DataFrame(rows))
+    curves = [
+        row
+        for seed in range(5)
+        for row in curve_of("ppo-road", (120.0, 85.0, 86.0), seed, f"ppo-road{seed}")
+    ]
+    curves += curve_of("qr-dqn", (120.0, 80.0), 0, "qr-dqn0")
+    write_table(tmp_path / policies.CURVES, pl.DataFrame(curves))
+    return tmp_path
 
 
 def line(text, start):
     """Return the entries of the first line of a table that starts so."""
-    found = next(each for each in text.splitlines() if each.startswith(f"| {start}"))
+    found = next(each for each in text.splitlines() if each.startswith(f"| {start} |"))
     return [each.strip() for each in found.strip("|").split("|")]
 
 
-def test_the_report_is_that_of_the_rows_and_dashes_stand_for_what_is_missing(recorded, tmp_path):
-    names = ["paper", "oldest-first", "plackett-luce"]
-    setting = recorded.filter(pl.col("policy").is_in(names), setting="paper")
-    world = {"part": "choices", **policies.WORLDS[0]._asdict(), "bandwidth": 2}
-    place = recorded.filter(pl.col("policy") != "oracle-gain", **world)
-    write_table(tmp_path / "rows.parquet", pl.concat([setting, place]))
+def entry(interval):
+    return f"{interval.mean:.1f} [{interval.low:.1f}, {interval.high:.1f}]"
+
+
+def test_the_report_compares_with_the_rule_that_validation_chose(ladder, errors):
+    write_report(policies.STUDY, ladder)
+    text = (ladder / "tables.md").read_text()
+    own = errors["ppo-road"]
+    typical = np.sort(own.mean(axis=1))[1:4].mean()
+    found = line(text, "ppo-road")
+    assert found[1].startswith(f"{typical:.1f} [")
+    assert found[2] == entry(bootstrap(percent_below, own, errors[BEST]))
+    assert found[3] == entry(bootstrap(percent_of_way, own, errors[ROUND_ROBIN], errors[GAIN]))
+    assert found[4:] == ["5", "1.00"]
+    assert line(text, "qr-dqn")[4:] == ["1", "0.50"]
+    assert line(text, BEST)[4:] == ["-", "-"]
+    # The learner with the most training seeds counts, and its best training in validation.
+    summary = line(text, "short")
+    assert summary[2] == f"{errors[BEST].mean():.1f} (`{BEST}`)"
+    assert summary[5:] == ["ppo-road", *found[2:4], "`trainings/short/ppo-road/0`"]
+    assert set(line(text, "private-1")[1:]) == {"-"}
+    assert {path.name for path in ladder.glob("*.png")} == {"fig_curves.png", "fig_below.png"}
+
+
+def test_what_was_not_played_yet_is_a_dash(ladder):
+    rows = read_rows("policies", ladder).filter(pl.col("policy") != GAIN)
+    write_table(ladder / "rows.parquet", rows)
+    (ladder / policies.CURVES).unlink()
+    write_report(policies.STUDY, ladder)
+    text = (ladder / "tables.md").read_text()
+    assert line(text, BEST)[2:] == ["0.0 [0.0, 0.0]", "-", "-", "-"]
+    assert line(text, "short")[4:] == ["-"] * 5
+    assert "| ppo-road |" not in text  # nothing says that these rows are those of its trainings
+
+
+def test_learners_are_ranked_by_one_training_seed_or_by_all():
+    curves = [
+        *curve_of("ppo-road", (99.0, 80.0), 0), *curve_of("ppo-road", (99.0, 90.0), 1),
+        *curve_of("maskable-ppo", (99.0, 83.0), 0), *curve_of("maskable-ppo", (83.0, 99.0), 1),
+        *curve_of("qr-dqn", (70.0,), 0), *curve_of("qr-dqn", (60.0,), 1, setting="private-1"),
+    ]  # fmt: skip
+    frame = pl.DataFrame(curves).with_columns(error=1000 * pl.col("validation"))
+    assert policies.ranked_learners(frame, "short", 0) == ["qr-dqn", "ppo-road", "maskable-ppo"]
+    assert policies.ranked_learners(frame, "short") == ["maskable-ppo", "ppo-road"]
+    assert policies.ranked_learners(frame, "long") == []
+
+
+def test_recorded_gains_are_those_of_their_rows(tmp_path):
+    if not RECORDED.is_dir():
+        pytest.skip("a source archive has no results")
+    world = policies.WORLDS[0]
+    labels = {**world._asdict(), "part": "choices", "bandwidth": 2}
+    rows = read_rows("policies", RECORDED).filter(**labels)
+    write_table(tmp_path / "rows.parquet", rows.filter(pl.col("policy") != GAIN))
     write_report(policies.STUDY, tmp_path)
-    text = (tmp_path / "tables.md").read_text()
-    own = errors(setting, part=TEST, kind="learned", mode="deterministic")
-    assert own.shape == (5, 64)
-    below = bootstrap(percent_below, own, errors(setting, part=TEST, policy="oldest-first"))
-    entry = f"{below.mean:.2f} [{below.low:.2f}, {below.high:.2f}]"
-    for start in ("paper: plackett-luce", "plackett-luce, training seeds: 5"):
-        assert line(text, start)[4::2] == [entry, "-"]  # no oracle
-    base = errors(place, policy="round-robin")
-    gain = bootstrap(percent_below, errors(place, policy="learned"), base)
-    entry = f"{gain.mean:.1f} [{gain.low:.1f}, {gain.high:.1f}]"
-    assert line(text, "2 (13 %)")[2::2] == [f"{base.mean():.1f}", entry, line(text, "2 (13 %)")[6]]
-    assert line(text, "2 (13 %)")[7] == "-"
-    assert set(line(text, "5 (33 %)")[1:]) == {"-"}
+
+    def errors(policy):
+        own = rows.filter(policy=policy).sort("training_seed", "traffic_seed")
+        return -1000.0 * own["reward"].to_numpy().reshape(-1, 32)
+
+    gain = bootstrap(percent_below, errors("learned"), errors(ROUND_ROBIN))
+    found = line((tmp_path / "tables.md").read_text(), "2")
+    assert found[3:] == ["-", entry(gain)]
 
 
-def test_validation_traffic_alone_decides(recorded):
-    rows = recorded.filter(setting="paper")
-
-    def choice(**labels):
-        best = pl.all_horizontal(pl.col(name) == value for name, value in labels.items())
-        changed = rows.with_columns(reward=pl.when(best).then(0.0).otherwise("reward"))
-        return policies.choose(changed)["paper"][:3]
-
-    assert choice(part=TEST, policy="static") == ("oldest-first", "plackett-luce", "deterministic")
-    assert choice(part=VALIDATION, policy="static")[0] == "static"
-    assert choice(part=VALIDATION, mode="stochastic")[2] == "stochastic"
-    traffic = {*policies.RECORDED_TRAFFIC, *policies.VALIDATION_TRAFFIC}
-    assert traffic <= set(VALIDATION_SEEDS)
+def test_traffic_of_trainings_choices_and_tests_is_apart():
+    for setting in policies.SETTINGS.values():
+        for own, kind in zip(
+            setting.traffic, (TRAINING_SEEDS, VALIDATION_SEEDS, TEST_SEEDS, TEST_SEEDS), strict=True
+        ):
+            assert set(own) <= set(kind)
+        assert set(setting.traffic.gain) <= set(setting.traffic.test)
 
 
-def test_the_recipe_that_was_chosen_is_moved_in_the_mode_that_was(recorded):
-    chosen = policies.choose(recorded)
-    chosen[PRIMARY] = chosen[PRIMARY]._replace(recipe="b", mode="stochastic")
-    given = [policies.Trained(PRIMARY, recipe, 0, f"{recipe}.zip") for recipe in "ab"]
-    cells = [each for each in policies.test_cells(chosen, given) if each.policy.endswith(".zip")]
-    moved = [each for each in cells if each.transferred]
-    assert {each.labels["setting"] for each in cells if each not in moved} == {PRIMARY}
-    assert len(cells) == 4 + len(moved) == 4 + len(policies.SETTINGS) - 2
-    assert {(each.policy, each.deterministic) for each in moved} == {("b.zip", False)}
+def test_every_learner_has_a_plan_in_the_settings_that_it_fits():
+    pairs = [pair for pair in product(policies.SETTINGS, policies.LEARNERS) if fits(*pair)]
+    assert len(pairs) == 7 * 7 - 4
+    assert [name for name, learner in pairs if learner == "qr-dqn"] == [
+        "short", "short-paced", "private-1",
+    ]  # fmt: skip
+    for setting, learner in pairs:
+        if learner != STARTED:
+            assert plan_of(Training(setting, learner, 0), Path(), 10.0).worlds
 
 
-def test_policies_that_cannot_be_found_are_refused():
-    for given, error in (
-        ("nowhere=a.zip", ValueError), ("paper", ValueError), ("paper=missing", FileNotFoundError),
-    ):  # fmt: skip
-        with pytest.raises(error, match=given.partition("=")[2] or given):
-            policies.study([given])
+def test_plackett_luce_has_as_many_rounds_as_the_time_allows():
+    setting = policies.SETTINGS["long"]
+    whole = plan_of(Training("long", "plackett-luce", 3), Path(), 10.0)
+    half = plan_of(Training("long", START, 3), Path(), 10.0)
+    assert whole.algorithm.swaps.rounds == round((10 - setting.regression) / setting.swaps)
+    assert half.algorithm.swaps.rounds == round((5 - setting.regression) / setting.swaps)
+    assert (whole.seed, whole.minutes, whole.algorithm.n_envs) == (3, None, 16)
+    assert plan_of(Training("long", START, 0), Path(), 0.1).algorithm.swaps.rounds == 1
+    assert plan_of(Training("long", "ppo-road", 0), Path(), 10.0).algorithm.validations == 12
 
 
 @pytest.mark.slow
-def test_a_small_study_plays_validation_then_test_traffic(tmp_path, monkeypatch):
-    capped = {"privacy": "capped"}
-    keywords = {"estimator": "random_walk", "bandwidth": 2, "horizon": 80, **capped}
-    calm = {**keywords, "incident": "none"}
-    small = {
-        "SETTINGS": {
-            PRIMARY: policies.Setting("a short road", keywords, SHORT),
-            "moved": policies.Setting("calm", calm, SHORT),
-        },
-        "WORLDS": (policies.World("highway", "capped", "random_walk"),),
-        "RULES": ("paper", "round-robin"), "TOGETHER": (), "EPSILONS": (5.0,),
-        "VALIDATION_TRAFFIC": (1000, 1001), "TEST_TRAFFIC": (2000, 2001),
-        "ENVS": {"highway": SHORT}, "BANDWIDTHS": {"highway": (1, 2)},
-        "CHOICE_TRAFFIC": {"highway": (2000, 2001)},
-        "TRAFFIC": {"own": {"horizon": 80}, "krauss-two-peaks": {"horizon": 90}},
-    }  # fmt: skip
-    for name, value in small.items():
-        monkeypatch.setattr(policies, name, value)
-    runs = tmp_path / "runs"
-    for seed in range(2):
-        save_untrained(runs / f"pl-{seed}" / "best.safetensors", seed=seed, **capped)
-    with pytest.raises(ValueError, match="both plackett-luce of training seed 0"):
-        policies.study([f"primary={runs}", f"primary={runs}/pl-0"])
-    study = policies.study([f"primary={runs}", f"capped={runs}"])
-    run(study, Place(tmp_path, THIS_PROCESS), progress=False)
-    rows = read_rows("policies", tmp_path)
-    test = rows.filter(part=TEST)
-    assert set(rows.filter(part=VALIDATION)["traffic_seed"]) == {1000, 1001}
-    assert rows.filter(part=VALIDATION)["cell"].n_unique() == 2 + 2 + 2 * 2  # both modes of both
-    assert test["cell"].n_unique() == 2 + 2 + 2 * 2 + 2 * 1 + 2  # and both oracles, and moved ones
-    assert rows.filter(policy="learned")["cell"].n_unique() == 2 * (2 + 1)
-    (mode,) = test.filter(setting="moved", kind="learned")["mode"].unique()
-    assert mode == json.loads((tmp_path / "chosen.json").read_text())[PRIMARY]["mode"]
-    assert "| plackett-luce, training seeds: 2 |" in (tmp_path / "tables.md").read_text()
+def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
+    keywords = {"estimator": "random_walk", "bandwidth": 1, "horizon": 80, "privacy": "capped"}
+    traffic = policies.Traffic((0, 1), (1000, 1001), (2000, 2001, 2002), (2000, 2001))
+    setting = policies.Setting("a short road", SHORT, keywords, 0.001, 0.001, traffic)
+    learners = {
+        "ppo-perceptron": ("ppo", {**SMALL["ppo"], "policy": "mlp"}),
+        "qr-dqn": ("qr-dqn", SMALL["qr-dqn"]),
+        "plackett-luce": ("plackett-luce", SMALL["plackett-luce"]),
+        STARTED: ("ppo", {k: v for k, v in SMALL["ppo"].items() if k != "hidden"}),
+    }
+    rounds = {"regression": setting.regression, "swaps": 0.02}
+    for module in (policies, policies.trainings):
+        monkeypatch.setattr(module, "LEARNERS", learners)
+        monkeypatch.setattr(module, "SETTINGS", {"short": setting._replace(**rounds)})
+        monkeypatch.setattr(module, "RULES", (ROUND_ROBIN, "paper"))
+    cells = tuple(policies._cell("short", rule, VALIDATION) for rule in (ROUND_ROBIN, "paper"))
+    study = policies.Study("policies", cells, (), policies.report, policies.test_cells)
+    place = Place(tmp_path, THIS_PROCESS)
+    train_ladder(study, place, 0.05, (0,))
+    curves = read_table(tmp_path / policies.CURVES)
+    assert set(curves["policy"]) == set(learners)
+    kept = tmp_path / "trainings" / "short" / "qr-dqn" / "0" / "checkpoint.pt"
+    before = kept.stat().st_mtime_ns
+    shutil.rmtree(tmp_path / "trainings" / "short" / "plackett-luce")  # as one that was killed
+    train_ladder(study, place, 0.05, (0, 1))
+    assert kept.stat().st_mtime_ns == before
+    curves = read_table(tmp_path / policies.CURVES)
+    seeds = curves.group_by("policy").agg(pl.col("training_seed").n_unique())
+    assert sorted(seeds["training_seed"]) == [1, 1, 2, 2]
+    started = curves.filter(policy=STARTED, training_seed=0)
+    assert started["seconds"].min() > 0.0
+    run(study, place, progress=False)
+    rows = read_rows("policies", tmp_path).filter(part=TEST)
+    assert rows["cell"].n_unique() == 2 + 2 + 6
+    assert rows.filter(policy=GAIN)["traffic_seed"].n_unique() == 2
+    assert "| plackett-luce |" in (tmp_path / "tables.md").read_text()
+    with pytest.raises(ValueError, match=r"another plan: minutes is 0\.05 there and 0\.1 now"):
+        train_ladder(study, place, 0.1, (0,))
