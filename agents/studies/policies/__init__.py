@@ -132,13 +132,13 @@ _CAPPED: dict[str, Any] = {"bandwidth": 5, "privacy": {"preset": "capped", "epsi
 SETTINGS = {
     "short": Setting("ShortHighway-v0, B = 1", SHORT, _ONE, 1.0, 0.5),
     "short-paced": Setting("ShortHighway-v0, paced, B = 1", SHORT, _ONE | _PACED, 1.0, 0.5),
-    "private-1": Setting("PrivateHighway-v1, B = 1", PRIVATE, _ONE, 1.5, 1.0),
-    "private-2": Setting("PrivateHighway-v1, B = 2", PRIVATE, _TWO, 1.5, 1.0),
+    "private-1": Setting("PrivateHighway-v1, B = 1", PRIVATE, _ONE, 2.5, 2.0),
+    "private-2": Setting("PrivateHighway-v1, B = 2", PRIVATE, _TWO, 2.5, 2.0),
     "long": Setting("LongHighway-v0, B = 2", LONG, _TWO, 2.0, 1.0, LONG_TRAFFIC, LONG_CHANGES),
     "long-recurrent": Setting(
         "LongHighway-v0, recurrent, B = 2", LONG, _RECURRENT, 2.0, 1.0, LONG_TRAFFIC, LONG_CHANGES
     ),
-    "paper": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED, 1.5, 1.0),
+    "paper": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED, 2.5, 2.0),
 }
 CURVES = "curves.parquet"
 """Learning curves of the trainings that are finished, a line for each validation, with the digest
