@@ -23,8 +23,9 @@ BEST, OTHER = "speed-front", "paper"
 def rows_of(policy, errors, part=TEST, setting="short", seed=-1, digest=""):
     """Return rows of a cell with the given errors x 1000 on traffic from 2200 on."""
     same = {
-        "study": "policies", "version": "0.1.0", "cell": f"{part} {setting} {policy} {seed} {digest}",
-        "part": part, "setting": setting, "policy": policy, "training_seed": seed, "digest": digest,
+        "study": "policies", "version": "0.1.0", "part": part, "setting": setting,
+        "cell": f"{part} {setting} {policy} {seed} {digest}",
+        "policy": policy, "training_seed": seed, "digest": digest,
     }  # fmt: skip
     return [
         {**same, "traffic_seed": 2200 + k, "reward": -error / 1000}
