@@ -190,6 +190,13 @@ def test_plackett_luce_has_as_many_rounds_as_the_time_allows():
     assert plan_of(Training("long", "ppo-road", 0), Path(), 10.0).algorithm.validations == 12
 
 
+def test_a_time_that_is_none_is_refused_and_nothing_written(tmp_path):
+    place = Place(tmp_path / "out", THIS_PROCESS)
+    with pytest.raises(ValueError, match=r"train must be .*, got 0\.0"):
+        train_ladder(policies.STUDY, place, 0.0, (0,))
+    assert not place.folder.exists()
+
+
 @pytest.mark.slow
 def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     keywords = {"estimator": "random_walk", "bandwidth": 1, "horizon": 80, "privacy": "capped"}
