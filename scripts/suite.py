@@ -1,9 +1,8 @@
-"""Score policies in the tasks of the query suite.
+"""Score a query policy in the cells of the query suite, and write its card.
 
-dptse suite --policies round-robin --tasks short
+dptse suite mine.safetensors
 
-Scores stand beside those of the policies that come with the package. What a folder has of an
-earlier run is not played again.
+Scores stand beside the best rule's. What a folder has of an earlier run is not played again.
 """
 
 from __future__ import annotations
@@ -13,61 +12,54 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import polars as pl
+import tyro
+
+import dptse_env
+from agents.files import write_json
 from agents.play import Cell
 from agents.policies import policy_name
-from agents.studies.suite import (
-    LEARNED,
-    NAME,
-    ONE,
-    RULES,
-    TASKS,
-    ZERO,
-    Scores,
-    Task,
-    beside_recorded,
-    entry,
-    format_scores,
-    make_cell,
-    score_all,
-)
-from agents.study import read_rows
-from agents.study import run as run_study
+from agents.studies import suite
+from agents.study import Study, play_study
 from agents.terminal import make_table, print_table
-from dptse_env.utils.fields import require, require_name
 from scripts.cli import Machines
 
+CARD = "card.json"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Args(Machines):
-    """Score policies in the tasks of the query suite."""
+    """Score a query policy in the cells of the query suite, and write its card."""
 
-    policies: tuple[str, ...] = ()
-    """Schedules; saved policies by file or shipped name, "module:Class", or
-    "module:Class=model.zip" of stable-baselines3, which is unpickled: load those that you trust."""
-    tasks: tuple[str, ...] = ()
-    """Tasks by name; all of them if none is given."""
-    output: Path = Path("results/my-suite")
-    """Folder of rows, tables and a figure."""
+    policy: tyro.conf.Positional[str]
+    """A schedule; a saved policy by file or shipped name, or "module:Class"."""
+    beside: tuple[Path, ...] = ()
+    """Cards of other policies, to be shown beside it."""
+    output: Path | None = None
+    """Folder of the card and the rows; results/my-suite/POLICY if not given."""
 
 
 def main(args: Args) -> None:
-    """Play the policies in the tasks that they suit, and report."""
-    named = {policy_name(source): source for source in args.policies}
-    require(bool(named), "policies", "one or more", args.policies)
-    require(len(named) == len(args.policies), "policies", "of different names", args.policies)
-    for name in args.tasks:
-        require_name("tasks", name, [task.name for task in TASKS])
-    tasks = [task for task in TASKS if not args.tasks or task.name in args.tasks]
-    cells = [
-        cell
-        for name, source in named.items()
-        for cell in suitable([make_cell(task, name, source) for task in tasks], source)
-    ]
-    study = entry(cells, tasks)
-    run_study(study, args.place(args.output))
-    rows = beside_recorded(read_rows(study.name, args.output), study.cells)
-    print_scores(score_all(rows, tasks), list(named), tasks)
-    print(f"tables and the figure are in {args.output}/")
+    """Play the policy in the cells that it suits, write its card, and print scores."""
+    name = policy_name(args.policy)
+    others = [suite.read_card(path) for path in args.beside]
+    recorded = suite.recorded_rows()
+    cells = suitable(
+        [suite.make_cell(each, name, args.policy) for each in suite.CELLS], args.policy
+    )
+    # A schedule by "module:Class" has a character that not every system allows in a path.
+    folder = args.output or Path("results/my-suite") / name.replace(":", "-")
+    study = Study("suite", cells, suite.SEEDS, lambda rows, folder: "")
+    played = play_study(study, args.place(folder))
+    # The folder may have rows of other policies, and of an earlier state of this one's file.
+    own = played.filter(
+        pl.col("cell").is_in([each.id for each in cells]), version=dptse_env.__version__
+    )
+    rows: pl.DataFrame = pl.concat([recorded, *others, own], how="diagonal_relaxed")
+    rows = rows.unique(("version", "policy", "name", "traffic_seed"), keep="last")
+    write_json(folder / CARD, suite.make_card(rows, name, args.policy))
+    print_scores(rows, [name, *(each["policy"][0] for each in others)])
+    print(f"the card is {folder / CARD}")
 
 
 def suitable(cells: Sequence[Cell], what: str) -> tuple[Cell, ...]:
@@ -93,20 +85,17 @@ def suitable(cells: Sequence[Cell], what: str) -> tuple[Cell, ...]:
     return tuple(taken)
 
 
-def print_scores(scores: Scores, names: Sequence[str], tasks: Sequence[Task]) -> None:
-    """Print the scores of policies by task, beside the best of those that come with the package."""
-    others = [name for name in (*RULES, *LEARNED) if name not in (*names, ZERO, ONE)]
-
-    def best(task: str) -> str:
-        known = {name: scores[name][task] for name in others if task in scores.get(name, {})}
-        if not known:
-            return "-"
-        name = max(known, key=lambda name: known[name].mean)
-        return f"{name} {known[name].mean:.2f} ± {known[name].half_width:.2f}"
-
-    titles = [task.name for task in tasks]
-    table = make_table(f"{NAME}: scores", "task", *names, "best that comes with it")
-    columns = [format_scores(scores[name], tasks) for name in names]
-    for line in zip(["mean", *titles], *columns, ["", *map(best, titles)], strict=True):
+def print_scores(rows: pl.DataFrame, policies: Sequence[str]) -> None:
+    """Print scores by cell, those of the best rule beside them, and what the oracle gains."""
+    scores = suite.score_all(rows)
+    columns = {policy: suite.format_scores(each) for policy, each in scores.items()}
+    best = [next(policy for policy in scores if policy in suite.RULES)]
+    best += [suite.best_rule(rows, name) for name in suite.CELLS]
+    rules = [f"{rule} {columns[rule][place]}" for place, rule in enumerate(best)]
+    rooms = ["", *(f"{suite.room(rows, name).mean:.1f} %" for name in suite.CELLS)]
+    title = f"{suite.NAME}: {suite.ZERO} has 0, {suite.ONE} has 1"
+    table = make_table(title, "cell", *policies, "best rule", f"{suite.ONE} below it")
+    shown = [columns[policy] for policy in policies]
+    for line in zip(["mean", *suite.CELLS], *shown, rules, rooms, strict=True):
         table.add_row(*line)
     print_table(table)
