@@ -338,12 +338,12 @@ def untrained(action="slots", preset="short-highway", net_arch=None, seed=0, **k
     from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
     from stable_baselines3.common.policies import ActorCriticPolicy
 
-    from dptse_env.sb3 import PlackettLucePolicy
+    from dptse_env.sb3 import RoadPolicy
 
     config = resolve(preset, {**keywords, "action": action})
     torch.manual_seed(seed)
     if action == "slots":
-        policy = PlackettLucePolicy.from_config(config, width=8)
+        policy = RoadPolicy.from_config(config, width=8)
         with torch.no_grad():
             for weights in policy.parameters():  # fresh ones leave the rule as it is
                 weights.add_(0.05 * torch.randn_like(weights))

@@ -24,7 +24,7 @@ from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS, EnvConfig
 from dptse_env.evaluation import WARM_UP
 from dptse_env.parts import make_interface
 from dptse_env.release import RELEASE_MODELS
-from dptse_env.sb3 import PlackettLucePolicy
+from dptse_env.sb3 import RoadPolicy
 from dptse_env.utils.fields import (
     POSITIVE,
     Interval,
@@ -170,7 +170,7 @@ class SwapRounds:
 
 @dataclass(frozen=True)
 class PlackettLuceSettings(Algorithm):
-    """`dptse_env.sb3.PlackettLucePolicy`: a regression of errors, then rounds of swaps.
+    """`dptse_env.sb3.RoadPolicy`: a regression of errors, then rounds of swaps.
 
     One network can learn from several environments.
     """
@@ -196,13 +196,13 @@ class PlackettLuceSettings(Algorithm):
         """See `Algorithm`."""
         return self.swaps.rounds
 
-    def make_policies(self, worlds: Sequence[World]) -> list[PlackettLucePolicy]:
+    def make_policies(self, worlds: Sequence[World]) -> list[RoadPolicy]:
         """Return an untrained policy for each of the worlds; they have one network in common.
 
         Raises:
             ValueError: Observations have other channels than those of the first world.
         """
-        policies = [PlackettLucePolicy.from_config(worlds[0].config, width=self.width)]
+        policies = [RoadPolicy.from_config(worlds[0].config, width=self.width)]
         for world in worlds[1:]:
             try:
                 policies.append(policies[0].sharing(world.config))

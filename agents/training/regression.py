@@ -18,11 +18,15 @@ from torch import Tensor
 from agents.training.episodes import TrainingEpisodes
 from agents.training.plan import Regression
 from dptse_env.process import QueryProcess
-from dptse_env.sb3 import PlackettLucePolicy
+from dptse_env.sb3 import RoadPolicy
 from dptse_env.utils.arrays import FloatArray, Observation
 
 FLOOR = 1e-4
 """Added to squared errors: below an error of a hundredth, differences do not matter."""
+
+RULE = {"density_log_std": 2.8, "speed_log_std": 1.2, "age": 7.2}
+"""Weights of the scores in the first round: a policy that has learned nothing queries segments
+whose estimate is uncertain or that have not been observed for long."""
 
 VARIANCE = {"density_log_std": 0.5, "speed_log_std": 0.5, "age": 0.1}
 """Initial weights of the fit: logarithms of squared errors near the estimator's own variances."""
@@ -61,9 +65,7 @@ class Practice:
         errors: Squared errors of the same seconds, each (n, n_mainline).
     """
 
-    def __init__(
-        self, policy: PlackettLucePolicy, episodes: TrainingEpisodes, batch_size: int
-    ) -> None:
+    def __init__(self, policy: RoadPolicy, episodes: TrainingEpisodes, batch_size: int) -> None:
         """Begin the episodes."""
         self.policy, self.batch_size = policy, batch_size
         self.seen: list[Tensor] = []
@@ -111,13 +113,14 @@ def regress(
     levels = torch.full((len(practice),), LEVEL, requires_grad=True)
     optimizer = torch.optim.Adam([*policy.scorer.parameters(), levels], lr=settings.rate)
     batches = settings.batches * len(practice)
+    _add(policy, RULE, 1.0)
     for index in range(settings.rounds):
         for each in practice:
             each.collect(settings, targets)
         if index:
             _add(policy, bonus, -settings.sharpness)
         else:
-            _add(policy, policy.rule, -1.0)
+            _add(policy, RULE, -1.0)
             _add(policy, VARIANCE, settings.sharpness)
         samples = [(torch.cat(each.seen), torch.cat(each.errors)) for each in practice]
         for batch in range(batches):
@@ -135,8 +138,8 @@ def regress(
     policy.scorer.zero_grad()
 
 
-def _add(policy: PlackettLucePolicy, weights: Mapping[str, float], factor: float) -> None:
+def _add(policy: RoadPolicy, weights: Mapping[str, float], factor: float) -> None:
     """Add multiples of ``weights`` to the weights of the rule."""
     with torch.no_grad():
-        for k, name in enumerate(policy.rule):
-            policy.scorer.rule[k] += factor * weights.get(name, 0.0)
+        for name, weight in weights.items():
+            policy.scorer.rule.weight[0, policy.road.index(name)] += factor * weight

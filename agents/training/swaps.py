@@ -32,7 +32,7 @@ from agents.seeds import training_seed
 from agents.training.plan import SwapRounds, first_second
 from dptse_env.evaluation import Policy
 from dptse_env.process import QueryProcess
-from dptse_env.sb3 import PlackettLucePolicy
+from dptse_env.sb3 import RoadPolicy
 from dptse_env.utils.arrays import Action, AnyArray, FloatArray, IntArray, Observation
 from dptse_env.vector_env import SensorQueryVectorEnv
 
@@ -178,7 +178,7 @@ class _Gains:
     """
 
     def __init__(
-        self, policy: PlackettLucePolicy, swaps: Swaps, settings: SwapRounds, batch_size: int
+        self, policy: RoadPolicy, swaps: Swaps, settings: SwapRounds, batch_size: int
     ) -> None:
         gains = np.clip(swaps.gain / swaps.error.mean(), -LARGEST_GAIN, LARGEST_GAIN)
         gains -= settings.price * swaps.spent
@@ -201,7 +201,7 @@ class _Gains:
 
 
 def raise_scores(
-    policies: Sequence[PlackettLucePolicy],
+    policies: Sequence[RoadPolicy],
     swaps: Sequence[Swaps],
     settings: SwapRounds,
     step: float,

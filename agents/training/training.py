@@ -26,7 +26,7 @@ from agents.training.regression import Practice, regress
 from agents.training.run import POLICY, Progress, Run, Watcher
 from agents.training.run_files import Row, check_plan, read_checkpoint
 from agents.training.swaps import raise_scores, try_swaps
-from dptse_env.sb3 import PlackettLucePolicy
+from dptse_env.sb3 import RoadPolicy
 from dptse_env.traffic import Records
 
 
@@ -63,7 +63,7 @@ def train(
 
 
 def train_in_rounds(run: Run) -> None:
-    """Train a `PlackettLucePolicy` in rounds: the regression, then those of swaps.
+    """Train a `RoadPolicy` in rounds: the regression, then those of swaps.
 
     Every round leaves a checkpoint with everything that the next one depends on: a training that
     was killed goes on to the same bits, on the same machine with the same number of torch's
@@ -107,7 +107,7 @@ def train_in_rounds(run: Run) -> None:
     run.save(POLICY, policies[0], run.rows[-1])
 
 
-def _regress(run: Run, settings: Regression, policies: Sequence[PlackettLucePolicy]) -> int:
+def _regress(run: Run, settings: Regression, policies: Sequence[RoadPolicy]) -> int:
     """Do the regression; return the seconds of traffic that it took. Its memory is freed then."""
     if not settings.rounds:
         return 0

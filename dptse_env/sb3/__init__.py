@@ -4,15 +4,16 @@ from dptse_env.policies import shipped_policies
 from dptse_env.utils.registry import needed_for
 
 with needed_for("dptse_env.sb3"):
-    from dptse_env.sb3.plackett_luce import PlackettLuce, PlackettLucePolicy, RoadChannels
+    from dptse_env.sb3.road_policy import PlackettLuce, RoadChannels, RoadPolicy
     from dptse_env.sb3.saved import ActingPolicy, load_policy, save_policy
-    from dptse_env.sb3.vec_env import SB3VecEnv
+    from dptse_env.sb3.vec_env import ReplicaBaseline, SB3VecEnv
 
 __all__ = [
     "ActingPolicy",
     "PlackettLuce",
-    "PlackettLucePolicy",
+    "ReplicaBaseline",
     "RoadChannels",
+    "RoadPolicy",
     "SB3VecEnv",
     "load_policy",
     "save_policy",

@@ -19,11 +19,11 @@ from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
 from dptse_env.policies import SUFFIX, TRANSFERABLE, read_policy
-from dptse_env.sb3.plackett_luce import PlackettLucePolicy, RoadChannels
+from dptse_env.sb3.road_policy import RoadChannels, RoadPolicy, config_of
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import Action, BoolArray, Observation
-from dptse_env.utils.fields import Interval, integer, number
+from dptse_env.utils.fields import integer
 from dptse_env.utils.files import write_tensors
 from dptse_env.utils.registry import needed_for, require_registered
 
@@ -33,12 +33,17 @@ POLICY_FORMAT = "dptse-policy-1"
 MOST_LAYERS = 64
 """Largest number of layers of a perceptron."""
 
-SHARED, MASKED = "PlackettLucePolicy", "MaskableActorCriticPolicy"
+SHARED, MASKED = "RoadPolicy", "MaskableActorCriticPolicy"
+CRITIC = "critic."
+"""Beginning of the names of a `RoadPolicy`'s weights that actions do not depend on."""
+
+ACTOR_SIZES = ("width", "reach", "skips_sensors")
+"""Arguments of a `RoadPolicy` that its actor depends on."""
+
 CLASSES = (SHARED, "ActorCriticPolicy", MASKED)
 """Classes of policies that can be saved. The network of the first is shared by all segments."""
 
 _PLAIN = "single segments"
-_LARGEST_RULE = Interval(-1e6, 1e6)
 
 
 class ActingPolicy:
@@ -105,7 +110,7 @@ def save_policy(
 
     Args:
         path: A file that ends in ``.safetensors``.
-        policy: One of `PlackettLucePolicy`, ``ActorCriticPolicy``, ``MaskableActorCriticPolicy``.
+        policy: One of `RoadPolicy`, ``ActorCriticPolicy``, ``MaskableActorCriticPolicy``.
         config: Configuration of the environment that it was trained on.
         env: Id of that environment.
         keywords: Keywords of that environment, plain JSON.
@@ -135,7 +140,11 @@ def save_policy(
         "training": dict(training),
         "figures": dict(figures),
     }
-    weights = {key: value.detach().cpu().numpy() for key, value in policy.state_dict().items()}
+    weights = {
+        key: value.detach().cpu().numpy()
+        for key, value in policy.state_dict().items()
+        if name != SHARED or not key.startswith(CRITIC)
+    }
     try:
         require_registered(card["fits"]["action"], "fits.action")
         _made(card, weights, config)
@@ -158,7 +167,7 @@ def load_policy(
         env: The environment in which it acts: of this package, scalar or vector, wrapped or not,
             or as an `SB3VecEnv`.
         allow: Properties that may differ on purpose, of `TRANSFERABLE`. Estimator, privacy and
-            traffic model may always differ. With ``"corridor"`` a `PlackettLucePolicy` acts on
+            traffic model may always differ. With ``"corridor"`` a `RoadPolicy` acts on
             roads of any size whose observations have the same channels (`RoadChannels`); a
             perceptron's observations must have the same size.
 
@@ -170,7 +179,7 @@ def load_policy(
     unknown = [name for name in allow if name not in TRANSFERABLE]
     if unknown:
         raise ValueError(f"allow must be of {', '.join(TRANSFERABLE)}, got {unknown[0]!r}")
-    config = _config_of(env)
+    config = config_of(env)
     file = read_policy(source)
     try:
         _check_fit(file.card, config, allow)
@@ -187,14 +196,6 @@ def describe_road(corridor: Corridor) -> str:
         f"{corridor.name} ({corridor.n_mainline} mainline segments of {length:g} km, "
         f"{corridor.most_lanes} lanes, fixed sensors on {list(corridor.fixed_sensors)})"
     )
-
-
-def _config_of(env: Any) -> EnvConfig:
-    base = env.unwrapped
-    config = getattr(base, "config", None) or getattr(getattr(base, "env", None), "config", None)
-    if not isinstance(config, EnvConfig):
-        raise ValueError(f"env must be an environment of this package, got {env}")
-    return config
 
 
 # The environment that a policy fits.
@@ -260,9 +261,8 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
 
 def _arguments(policy: BasePolicy) -> dict[str, Any]:
     """Return the arguments from which `_made` makes such a policy, as plain JSON."""
-    if isinstance(policy, PlackettLucePolicy):
-        names = ("width", "rule", "skips_sensors")
-        return {name: getattr(policy, name) for name in names}
+    if isinstance(policy, RoadPolicy):
+        return {name: policy.sizes[name] for name in ACTOR_SIZES}
     # Maskable policies have the same attributes, without being of the same class.
     perceptron: Any = policy
     if perceptron.activation_fn is not nn.Tanh:
@@ -289,10 +289,13 @@ def _made(
     with torch.random.fork_rng(devices=[]):
         if name == SHARED:
             _check_shared(arguments, n_values)
-            policy: BasePolicy = PlackettLucePolicy.from_config(config, **arguments)
+            policy: BasePolicy = RoadPolicy.from_config(config, **arguments)
         else:
             policy = _perceptron(name, arguments, config, n_values)
     tensors = {key: torch.tensor(array) for key, array in weights.items()}
+    if name == SHARED:
+        own = policy.state_dict()
+        tensors |= {key: own[key] for key in own if key.startswith(CRITIC)}
     try:
         policy.load_state_dict(tensors)
     except RuntimeError as problem:  # the message has a line for each of them
@@ -302,13 +305,12 @@ def _made(
 
 
 def _check_shared(arguments: Mapping[str, Any], n_values: int) -> None:
-    _check_names(arguments, {"width", "rule", "skips_sensors"})
-    width, rule = integer("policy.arguments.width", arguments["width"], 1), arguments["rule"]
-    _check_size(6 * width * width, n_values)  # of the trunk's second convolution and of its mean
-    if not isinstance(rule, dict) or not rule:
-        raise ValueError(f"policy.arguments.rule must be a mapping of blocks, got {rule!r:.80}")
-    for name, weight in rule.items():
-        number(float, weight, f"policy.arguments.rule.{name:.80}", _LARGEST_RULE)
+    _check_names(arguments, set(ACTOR_SIZES))
+    width, reach = (
+        integer(f"policy.arguments.{name}", arguments[name], 1) for name in ("width", "reach")
+    )
+    # Of the trunk's second convolution and of its mean.
+    _check_size(2 * (reach + 1) * width * width, n_values)
     if not isinstance(skips := arguments["skips_sensors"], bool):
         raise ValueError(f"policy.arguments.skips_sensors must be a bool, got {skips!r:.80}")
 

@@ -66,7 +66,6 @@ def test_a_loaded_policy_acts_as_the_saved_one(path, action, net_arch):
     np.testing.assert_allclose(both, [expected, expected], atol=1e-6)
     assert state is None
     if action == "slots":
-        # Weights of the rule belong to its blocks by their order.
         scores = (each.scores(torch.tensor(batch)) for each in (loaded._policy, policy))
         torch.testing.assert_close(*scores, rtol=0, atol=0)
     draws = []
@@ -101,7 +100,7 @@ def test_the_card_describes_the_policy(stored):
     )
     assert set(file.card["versions"]) == {"dptse-env", "stable-baselines3", "torch"}
     assert file.card["figures"] == ABOUT["figures"]
-    assert file.weights.keys() == policy.state_dict().keys()
+    assert file.weights.keys() == {f"scorer.{key}" for key in policy.scorer.state_dict()}
     assert file.identity == file.card["sha256"]
 
 
@@ -145,7 +144,7 @@ def test_a_shared_network_moves_on_purpose_to_another_road_and_bandwidth(path):
     loaded = load_policy(path, env, allow=("bandwidth", "corridor"))
     # The same weights, made for the short road.
     direct, _ = untrained(bandwidth=3)
-    direct.load_state_dict(policy.state_dict())
+    direct.scorer.load_state_dict(policy.scorer.state_dict())
     observation = observe(env)
     np.testing.assert_array_equal(
         loaded.predict(observation, deterministic=True)[0],
@@ -211,16 +210,14 @@ WRONG = {
         (lambda c, w: c["fits"].update(channels=[{}] * 9), r"channels is \['\{\}'\] for the"),
         (lambda c, w: c["policy"].update({"class": "Oracle"}), "must be one of .*'Oracle'"),
         (lambda c, w: c["policy"].update({"class": "ActorCriticPolicy"}), "must be net_arch"),
-        (arguments(width=10**9), r"describe 6e\+18 weights, it has 1\d{3}"),
+        (arguments(width=10**9), r"describe 4e\+18 weights, it has \d{3}"),
         (lambda c, w: (arguments(width=2000)(c, w), w.update(extra=np.zeros(2**22 - 2**14, "f4"))),
-         r"describe 2\.4e\+07 weights, it has 4\d{6}"),
+         r"describe 1\.6e\+07 weights, it has 4\d{6}"),
         (arguments(width=7), "size mismatch for scorer.trunk.near.weight"),
         (arguments(skips_sensors=1), "skips_sensors must be a bool"),
-        (arguments(depth=3), "arguments must be rule, skips_sensors, width, got"),
-        (arguments(rule={"colour": 1}), "must be one of .*'colour'"),
-        (arguments(rule={"age": 10**400}), r"rule\.age must be a number"),
+        (arguments(depth=3), "arguments must be reach, skips_sensors, width, got"),
         (lambda c, w: w.update(extra=np.zeros(2, "f4")), r'Unexpected key\(s\) .*"extra"'),
-        (lambda c, w: w.pop("scorer.rule"), r'Missing key\(s\) in state_dict: "scorer.rule"'),
+        (lambda c, w: w.pop("scorer.rule.weight"), r'Missing key\(s\) .*"scorer.rule.weight"'),
     ],
     "mask": [
         (arguments(net_arch=[12_000] * 3), r"describe 2\.\d+e\+08 weights, it has 2"),
@@ -291,7 +288,7 @@ def test_what_cannot_be_saved(stored):
     policy, config = untrained()
     with pytest.raises(ValueError, match=r"path must end in \.safetensors"):
         save_policy(stored.with_suffix(".pt"), policy, config, **ABOUT)
-    with pytest.raises(ValueError, match="policy must be one of PlackettLucePolicy"):
+    with pytest.raises(ValueError, match="policy must be one of RoadPolicy"):
         save_policy(stored, torch.nn.Linear(1, 1), config, **ABOUT)
     with pytest.raises(ValueError, match="weights must be of float32 alone"):
         save_policy(stored, untrained()[0].double(), config, **ABOUT)
@@ -299,8 +296,8 @@ def test_what_cannot_be_saved(stored):
     with pytest.raises(ValueError, match=r"cannot be written: its header must have at most"):
         save_policy(stored, policy, config, **long)
     with torch.no_grad():
-        policy.scorer.rule[0] = torch.nan
-    with pytest.raises(ValueError, match=r"cannot be written: scorer.rule must be finite"):
+        policy.scorer.rule.weight[0] = torch.nan
+    with pytest.raises(ValueError, match=r"cannot be written: scorer.rule.weight must be finite"):
         save_policy(stored, policy, config, **ABOUT)
     perceptron, masked = untrained("mask")
     perceptron.extra = torch.nn.Linear(1, 1)

@@ -1,4 +1,4 @@
-"""`SB3VecEnv` is a ``DummyVecEnv`` of scalar environments, and agents learn on it."""
+"""`SB3VecEnv` is a ``DummyVecEnv`` of scalar environments; agents learn on it, with replicas."""
 
 import gymnasium as gym
 import numpy as np
@@ -8,19 +8,21 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
 from sb3_contrib import MaskablePPO
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from dptse_env.sb3 import SB3VecEnv
+from dptse_env.sb3 import ReplicaBaseline, SB3VecEnv
 from tests.helpers import EPISODES, SHORT, SumRelease, assert_same, make_batch
 
 ACTIONS = np.eye(3, 6, dtype=np.int8)
 
 
-def make(num_envs=3, **keywords):
-    return SB3VecEnv(make_batch(num_envs, **{"autoreset_mode": "SameStep", **keywords}))
+def make(num_envs=3, replicas=1, **keywords):
+    keywords = {"autoreset_mode": "SameStep", **keywords}
+    return SB3VecEnv(make_batch(num_envs, **keywords), replicas)
 
 
 @pytest.mark.parametrize(
@@ -145,3 +147,95 @@ def test_maskable_ppo_picks_what_fits_where_decisions_take_different_numbers_of_
     assert not any(dropped)
     picks = model.rollout_buffer.actions[..., 0]
     assert set(np.unique(picks).astype(int)) <= set(range(11))
+
+
+def groups_of(env, value):
+    """Return what each replica has, shape (groups, replicas, ...)."""
+    return np.reshape(value, (env.num_envs // env.replicas, env.replicas, -1))
+
+
+@pytest.mark.parametrize(
+    ("seed", "keywords"),
+    [
+        (5, {}),
+        (None, {"estimator": "enkf", "detectors": {"dropout": 0.1}}),
+        (5, {"action": "sequential", "privacy": SumRelease, "query_spans": (1, 2), "bandwidth": 3}),
+    ],
+)
+def test_replicas_meet_the_same_traffic_and_noise_after_resets_too(seed, keywords):
+    env = make(6, 3, **{"truth_in_info": True, "privacy": "capped", **keywords})
+    if seed is not None:
+        assert env.seed(seed) == [5, 5, 5, 6, 6, 6]
+    env.action_space.seed(0)
+    starts = set()
+    for step in range(40):
+        if step in (0, 20):
+            observation = env.reset()
+        else:
+            actions = np.repeat([env.action_space.sample() for _ in range(2)], 3, axis=0)
+            observation, rewards, dones, _ = env.step(actions)
+            assert (groups_of(env, rewards) == groups_of(env, rewards)[:, :1]).all()
+            assert (groups_of(env, dones) == groups_of(env, dones)[:, :1]).all()
+            assert dones.all() or rewards[0] == 0.0 or rewards[0] != rewards[3]
+        groups = groups_of(env, observation)
+        assert (groups == groups[:, :1]).all()
+        truths = [info["truth"] for info in env.reset_infos]
+        places = [(truth["traffic_seed"], truth["time"]) for truth in truths]
+        assert places[:3] == places[:1] * 3
+        assert places[3:] == places[3:4] * 3
+        starts |= {places[0], places[3]}
+    assert len(starts) > 4
+
+
+def test_what_a_replica_does_changes_nothing_for_the_others():
+    def play(first):
+        env = make(3, 3, truth_in_info=True, privacy="capped")
+        env.seed(2)
+        env.reset()
+        steps = [env.step(np.stack([one, ACTIONS[0], ACTIONS[0]])) for one in first]
+        return env, [np.column_stack([step[0], step[1]]) for step in steps]
+
+    (_, alike), (env, apart) = play(ACTIONS[[0] * 8]), play(ACTIONS[[0, 1, 2] * 3])
+    for one, other in zip(alike, apart, strict=False):
+        assert (one[1:] == other[1:]).all()
+    assert any((one[0] != other[0]).any() for one, other in zip(alike, apart, strict=False))
+    assert len({info["truth"]["time"] for info in env.reset_infos}) == 1
+
+
+class Look(BaseCallback):
+    """Keeps what the last rollout left at this place among the callbacks."""
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        buffer = self.model.rollout_buffer
+        self.advantages, self.returns = buffer.advantages.copy(), buffer.returns.copy()
+
+
+def test_the_baseline_of_an_advantage_is_the_mean_of_the_other_replicas():
+    env = VecNormalize(make(6, 3))
+    before, after = Look(), Look()
+    model = PPO("MlpPolicy", env, n_steps=4, batch_size=24, seed=0, device="cpu")
+    model.learn(24, [before, ReplicaBaseline(3), after])
+    others = np.kron(np.eye(2), (1 - np.eye(3)) / 2)
+    expected = before.advantages - before.advantages @ others
+    np.testing.assert_allclose(after.advantages, expected, atol=1e-6)
+    assert (after.returns == before.returns).all()
+    assert (after.advantages != before.advantages).any()
+
+
+def test_replicas_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="replicas must divide 3 episodes, got 2"):
+        make(3, 2)
+    with pytest.raises(ValueError, match="replicas must be"):
+        make(3, 0)
+    with pytest.raises(ValueError, match=r"privacy\.noise must not be 'secure'"):
+        make(2, 2, privacy={"noise": "secure"})
+    with pytest.raises(ValueError, match="replicas must be"):
+        ReplicaBaseline(1)
+    model = PPO("MlpPolicy", VecMonitor(make(4, 2)), n_steps=4, batch_size=16)
+    with pytest.raises(ValueError, match="replicas must be the environment's 2, got 4"):
+        model.learn(16, ReplicaBaseline(4))
+    with pytest.raises(ValueError, match=r"for PPO and its kin, got .*DQN"):
+        DQN("MlpPolicy", make(4, 2, action="sequential")).learn(16, ReplicaBaseline(2))

@@ -7,8 +7,8 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from agents.training.episodes import make_episodes
-from agents.training.regression import Practice, regress, squared_errors
-from dptse_env.sb3 import PlackettLucePolicy
+from agents.training.regression import RULE, Practice, regress, squared_errors
+from dptse_env.sb3 import RoadPolicy
 from tests.agents.training.plans import make_algorithm, make_plan
 from tests.helpers import SHORT
 
@@ -20,7 +20,7 @@ def make(**changes):
     keywords = {"traffic_seeds": "0:3", "action": "slots"}
     episodes = make_episodes(plan, plan.worlds[0], keywords)
     torch.manual_seed(0)
-    policy = PlackettLucePolicy.from_config(episodes.env.config, width=8)
+    policy = RoadPolicy.from_config(episodes.env.config, width=8)
     return algorithm.regression, Practice(policy, episodes, 64)
 
 
@@ -55,7 +55,8 @@ def test_the_bonus_for_age_is_added_once_after_any_number_of_rounds():
         regress([practice], settings, fractions.append)
         assert [len(each) for each in (practice.seen, practice.errors)] == [6, 6]
         policy = practice.policy
-        weights.append(dict(zip(policy.rule, policy.scorer.rule.tolist(), strict=True)))
+        rule = policy.scorer.rule.weight[0].tolist()
+        weights.append({name: rule[policy.road.index(name)] for name in RULE})
     assert fractions[:3] == pytest.approx([0.0, 1 / 3, 2 / 3])
     assert weights[0]["age"] - weights[1]["age"] == pytest.approx(0.5 * 4.0, rel=1e-4)
     # The rule is gone; half of a log deviation is a quarter of a log variance.

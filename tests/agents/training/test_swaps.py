@@ -12,7 +12,7 @@ from agents.seeds import training_seed
 from agents.training.plan import SwapRounds
 from agents.training.swaps import LARGEST_GAIN, Swaps, raise_scores, try_swaps
 from dptse_env.config import resolve
-from dptse_env.sb3 import PlackettLucePolicy
+from dptse_env.sb3 import RoadPolicy
 from tests.helpers import SHORT
 
 SECONDS, TRIALS, HORIZON, SEED = 6, 2, 40, 1
@@ -165,7 +165,7 @@ FIT = SwapRounds(price=0.01, batches=400, batch_size=256, rate=1e-2)
 def policy():
     torch.manual_seed(0)
     config = resolve("short-highway", {"action": "slots", "bandwidth": 2})
-    return PlackettLucePolicy.from_config(config, width=16)
+    return RoadPolicy.from_config(config, width=16)
 
 
 def planted(policy, gain=None, spent=None, n_states=300, trials=20):
@@ -207,7 +207,7 @@ def centred(values):
 
 def test_scores_move_by_a_step_of_the_expected_gain(policy):
     def gain(channels):
-        return 0.1 * np.tanh(channels[:, 0])
+        return 0.1 * np.tanh(channels[:, :, 0])
 
     swaps = planted(policy, gain)
     expected = centred(gain(policy.features(torch.from_numpy(swaps.observations)).numpy()))
@@ -217,7 +217,7 @@ def test_scores_move_by_a_step_of_the_expected_gain(policy):
 
 def test_budgets_have_their_price(policy):
     def spent(channels):
-        return 8.0 * (channels[:, 0] > 0.0)
+        return 8.0 * (channels[:, :, 0] > 0.0)
 
     swaps = planted(policy, None, spent)
     expected = -0.01 * centred(spent(policy.features(torch.from_numpy(swaps.observations)).numpy()))

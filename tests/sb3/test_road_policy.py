@@ -1,8 +1,9 @@
-"""The Plackett-Luce distribution, channels along the road, and the policy of both."""
+"""The Plackett-Luce distribution, channels along the road, and `RoadPolicy`, which has both."""
 
 import itertools
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -11,12 +12,13 @@ pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 
 import torch
+from stable_baselines3 import PPO
 
 from dptse_env.config import PRESETS, resolve
 from dptse_env.parts import make_interface
-from dptse_env.sb3 import PlackettLuce, PlackettLucePolicy, RoadChannels
-from dptse_env.sb3.plackett_luce import RoadFeatures
-from tests.helpers import PricedRelease, SumRelease
+from dptse_env.sb3 import PlackettLuce, RoadChannels, RoadPolicy, SB3VecEnv
+from dptse_env.sb3.road_policy import RoadFeatures, make_windows
+from tests.helpers import SHORT, PricedRelease, SumRelease
 
 # The distribution.
 
@@ -32,6 +34,10 @@ def by_formula(scores, chosen):
     return probability
 
 
+def sets_of(scores, size):
+    return PlackettLuce(size).proba_distribution(scores)
+
+
 def all_sets(n, size):
     return torch.tensor(list(itertools.permutations(range(n), size)))
 
@@ -39,7 +45,7 @@ def all_sets(n, size):
 def over_all(scores, size):
     """A distribution repeated for each ordered set, and these."""
     sets = all_sets(len(scores), size)
-    return PlackettLuce(scores.expand(len(sets), -1), size), sets
+    return sets_of(scores.expand(len(sets), -1), size), sets
 
 
 @pytest.mark.parametrize("size", [1, 2, 4])
@@ -56,7 +62,7 @@ def test_draws_follow_the_probabilities():
     distribution, sets = over_all(SCORES[0], 2)
     torch.manual_seed(0)
     n = 200_000
-    drawn = PlackettLuce(SCORES[:1].expand(n, -1), 2).sample()
+    drawn = sets_of(SCORES[:1].expand(n, -1), 2).sample()
     counts = (drawn[:, None, :] == sets).all(dim=2).sum(dim=0).numpy()
     assert counts.sum() == n
     probabilities = distribution.log_prob(sets).exp().numpy()
@@ -65,15 +71,15 @@ def test_draws_follow_the_probabilities():
 
 
 def test_the_mode_is_the_highest_scores_and_ties_go_upstream():
-    assert PlackettLuce(SCORES, 3).mode().tolist() == [[2, 0, 3], [0, 1, 3]]
-    assert PlackettLuce(torch.zeros(1, 70), 40).mode().tolist() == [list(range(40))]
+    assert sets_of(SCORES, 3).mode().tolist() == [[2, 0, 3], [0, 1, 3]]
+    assert sets_of(torch.zeros(1, 70), 40).mode().tolist() == [list(range(40))]
 
 
 @pytest.mark.parametrize("spread", [0.0, 1e3, 3e38])
 def test_extreme_scores_stay_finite_in_single_precision(spread):
     scores = (spread * torch.tensor([[1.0, -1.0, 0.5, 0.0, 1.0, -1.0]])).repeat(64, 1)
     scores.requires_grad_()
-    distribution = PlackettLuce(scores, 4)
+    distribution = sets_of(scores, 4)
     torch.manual_seed(1)
     for sets in (distribution.sample(), torch.tensor([[5, 1, 3, 2]]).repeat(64, 1)):
         assert (sets.sort(dim=1).values.diff(dim=1) > 0).all()
@@ -86,16 +92,22 @@ def test_extreme_scores_stay_finite_in_single_precision(spread):
 
 def test_bad_scores_and_sets_are_refused():
     with pytest.raises(ValueError, match=r"size must be in 1\.\.3, got 4"):
-        PlackettLuce(torch.zeros(1, 3), 4)
+        sets_of(torch.zeros(1, 3), 4)
     with pytest.raises(ValueError, match="scores must be finite"):
-        PlackettLuce(torch.tensor([[0.0, torch.inf]]), 1)
-    for chosen, message in (
-        ([[1, 1], [0, 2]], "distinct"),
-        ([[1, 4], [0, 2]], r"in \[0, 3\]"),
-        ([[1, 2, 3], [0, 1, 2]], r"shape \(2, 2\), got \(2, 3\)"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            PlackettLuce(SCORES, 2).log_prob(torch.tensor(chosen))
+        sets_of(torch.tensor([[0.0, torch.inf]]), 1)
+    pairs = sets_of(SCORES, 2)
+    with pytest.raises(ValueError, match=r"shape \(2, 2\), got \(2, 3\)"):
+        pairs.log_prob(torch.tensor([[1, 2, 3], [0, 1, 2]]))
+    with pytest.raises(RuntimeError, match="out of bounds"):
+        pairs.log_prob(torch.tensor([[1, 4], [0, 2]]))
+    assert pairs.log_prob(torch.tensor([[1, 1], [0, 2]])).isneginf().tolist() == [True, False]
+
+
+def test_the_bonus_is_the_entropy_of_one_draw_times_the_draws():
+    probabilities = SCORES.softmax(dim=1).numpy()
+    entropy = -(probabilities * np.log(probabilities)).sum(axis=1)
+    for size in (1, 3):
+        np.testing.assert_allclose(sets_of(SCORES, size).entropy(), size * entropy)
 
 
 # The observation as channels along the road.
@@ -112,7 +124,7 @@ def raw(road, name, observation):
     """The values of a channel before it is scaled; None where there are none."""
     (k,) = (k for k, channel in enumerate(road.channels) if channel.name == name)
     channel = road.channels[k]
-    shown = RoadFeatures(road)(observation)[0, k].numpy() * channel.scale + channel.centre
+    shown = RoadFeatures(road)(observation)[0, :, k].numpy() * channel.scale + channel.centre
     return [x if at is not None else None for x, at in zip(shown, channel.source, strict=True)]
 
 
@@ -125,7 +137,8 @@ def test_mainline_blocks_stand_at_their_segments():
         for name in ("density", "speed_log_std", "released_density", released, "age", "queried"):
             found = raw(road, f"mainline {name}", observation)
             np.testing.assert_allclose(found, starts[name] + np.arange(n), rtol=1e-5)
-        assert RoadFeatures(road)(observation).shape == (1, road.n_channels, n)
+        features = RoadFeatures(road)
+        assert features(observation).shape == (1, n, features.n_channels)
 
 
 def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
@@ -158,7 +171,7 @@ def test_prices_and_the_tracer_are_channels_where_they_are_observed():
 def make_policy(preset="private-highway", *, skips_sensors=True, **keywords):
     config = resolve(preset, {"action": "slots", **keywords})
     torch.manual_seed(0)
-    return PlackettLucePolicy.from_config(config, skips_sensors=skips_sensors)
+    return RoadPolicy.from_config(config, skips_sensors=skips_sensors)
 
 
 def observations(policy, k=64):
@@ -206,12 +219,13 @@ def test_a_segment_with_a_fixed_sensor_is_queried_when_there_is_no_other():
 def test_neighbours_and_the_whole_road_count():
     policy = make_policy()
     channels = policy.features(observations(policy, 1)).requires_grad_()
-    (gradient,) = torch.autograd.grad(policy.scorer(channels)[0, 7], channels)
-    seen = gradient[0].abs().sum(dim=0)
-    near = seen[3:12]
+    scores = policy.scorer(channels, make_windows(channels, 1))
+    (gradient,) = torch.autograd.grad(scores[0, 7], channels)
+    seen = gradient[0].abs().sum(dim=1)
+    near = seen[5:10]
     assert (near > 0).all()
-    # Two convolutions of width 5 reach four segments; what is further counts by the mean alone.
-    far = torch.cat([seen[:3], seen[12:]])
+    # Two convolutions of width 3 reach two segments; what is further counts by the mean alone.
+    far = torch.cat([seen[:5], seen[10:]])
     assert (far > 0).all()
     assert far.max() < near.max()
 
@@ -219,10 +233,10 @@ def test_neighbours_and_the_whole_road_count():
 def test_segments_share_one_scorer():
     """Shifted along a road without ramps, away from its ends, scores shift with the traffic."""
     policy = make_policy()
-    channels = torch.zeros(1, policy.road.n_channels, 15)
-    channels[0, :3, 7] = 1.0
-    scores = policy.scorer(channels)
-    shifted = policy.scorer(channels.roll(1, dims=2))
+    channels = torch.zeros(1, 15, policy.features.n_channels)
+    channels[0, 7, :3] = 1.0
+    moved = channels.roll(1, dims=1)
+    scores, shifted = (policy.scorer(each, make_windows(each, 1)) for each in (channels, moved))
     torch.testing.assert_close(shifted[:, 4:12], scores[:, 3:11])
 
 
@@ -231,12 +245,45 @@ def test_policies_of_two_environments_share_their_weights():
     config = resolve("short-highway", {"action": "slots", "bandwidth": 4})
     twin = policy.sharing(config)
     with torch.no_grad():
-        policy.scorer.rule.add_(1.0)
+        policy.scorer.rule.weight.add_(1.0)
     seen = observations(policy)
     torch.testing.assert_close(twin.scores(seen), policy.scores(seen), rtol=0, atol=0)
     assert twin.bandwidth == 4
     with pytest.raises(ValueError, match=r"one lacks \['mainline released_speed'\]"):
         policy.sharing(resolve("short-highway", {"action": "slots", "privacy": "capped"}))
+
+
+@pytest.mark.parametrize("bandwidth", [1, 3])
+def test_ppo_trains_saves_and_loads_it(bandwidth, tmp_path):
+    env = SB3VecEnv(
+        gym.make_vec(
+            SHORT, num_envs=4, action="slots", bandwidth=bandwidth, autoreset_mode="SameStep"
+        )
+    )
+    keywords = {"n_steps": 8, "batch_size": 16, "n_epochs": 2, "seed": 0}
+    model = PPO(RoadPolicy, env, policy_kwargs=RoadPolicy.kwargs(env), **keywords)
+    before = {key: value.clone() for key, value in model.policy.state_dict().items()}
+    model.learn(64)
+    after = model.policy.state_dict()
+    assert [key for key in after if torch.equal(after[key], before[key])] == []
+    model.save(tmp_path / "model.zip")
+    model.policy.save(tmp_path / "policy.pt")
+    seen = observations(model.policy).numpy()
+    expected, _ = model.predict(seen, deterministic=True)
+    assert expected.shape == (64, bandwidth)
+    for loaded in (PPO.load(tmp_path / "model.zip"), RoadPolicy.load(tmp_path / "policy.pt")):
+        np.testing.assert_array_equal(loaded.predict(seen, deterministic=True)[0], expected)
+
+
+def test_an_update_of_ppo_sees_what_a_rollout_did():
+    policy = make_policy(bandwidth=3)
+    seen = observations(policy)
+    actions, values, logs = policy(seen)
+    again = policy.evaluate_actions(seen, actions.float())  # as a rollout buffer keeps them
+    torch.testing.assert_close(again[0], values)
+    torch.testing.assert_close(again[1], logs)
+    torch.testing.assert_close(policy.predict_values(seen), values)
+    assert values.shape == (64, 1)
 
 
 def test_spaces_that_do_not_fit_are_refused():
@@ -246,8 +293,8 @@ def test_spaces_that_do_not_fit_are_refused():
     longer = spaces.Box(0, 1, (road.size + road.n_mainline,))
     for wrong in (longer, spaces.Box(0, 1, (3, 3)), taken):
         with pytest.raises(ValueError, match="observation_space must have shape"):
-            PlackettLucePolicy(wrong, taken, road=road)
+            RoadPolicy(wrong, taken, road=road)
     misfits = [spaces.Discrete(6), spaces.MultiDiscrete([6, 5]), spaces.MultiDiscrete([6] * 7)]
     for wrong in misfits:
         with pytest.raises(ValueError, match=r"MultiDiscrete\(\[6\] \* B\).* of action='slots'"):
-            PlackettLucePolicy(seen, wrong, road=road)
+            RoadPolicy(seen, wrong, road=road)

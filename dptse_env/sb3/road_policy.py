@@ -1,0 +1,600 @@
+"""`RoadPolicy`: scores every segment by one network, and queries an ordered set of them.
+
+Its parts come first: the distribution over ordered sets, the observation as channels along the
+road, the modules of the network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import Tensor, nn
+
+from dptse_env.config import EnvConfig
+from dptse_env.parts import make_interface
+
+LAST_PLACE = 1e4
+"""Subtracted from the scores of segments that are queried only when there are no others."""
+
+CENTRES = {
+    "density": (0.15, 0.15),
+    "speed": (0.6, 0.3),
+    "density_log_std": (-3.0, 1.0),
+    "speed_log_std": (-3.0, 1.0),
+    "released_density": (0.15, 0.3),
+    "released_speed": (0.6, 0.5),
+    "released_flow": (0.0, 0.1),
+    "density_innovation": (0.0, 1.5),
+    "speed_innovation": (0.0, 1.5),
+    "age": (0.1, 0.1),
+    "queried": (0.0, 1.0),
+    "fixed_density_innovation": (0.0, 1.5),
+    "fixed_speed_innovation": (0.0, 1.5),
+    "last_price": (0.0, 1.0),
+    "tracer": (0.5, 0.3),
+}
+"""Centre and scale of each block's values, chosen so that channels are of order one. They are
+constants rather than running statistics, which could be lost between training and use."""
+
+MAINLINE_BLOCKS = (
+    "density", "speed", "density_log_std", "speed_log_std", "density_innovation",
+    "speed_innovation", "age", "queried",
+)  # fmt: skip
+PRICE_BLOCKS = ("last_price", "tracer")
+"""Blocks with channels where the observation has them."""
+
+RAMP_BLOCKS = ("density", "speed", "density_log_std", "speed_log_std")
+FIXED_SENSOR_BLOCKS = ("fixed_density_innovation", "fixed_speed_innovation")
+
+
+class PlackettLuce(Distribution):
+    """Draws B distinct items of n in turn, each by softmax over the remaining ones.
+
+    With scores s the probability of the ordered set a_1, .., a_B is
+
+        prod_j  exp(s[a_j]) / sum_{i not in a_1 .. a_{j-1}} exp(s[i])
+
+    (Plackett, 1975); for B = 1 it is a categorical distribution. Sampling needs no loop: the order
+    of the B largest scores after adding independent Gumbel noise to each has this distribution
+    (Yellott, 1977; Kool et al., 2019).
+
+    Attributes:
+        size: B, items to draw.
+        scores: Shape (k, n), the largest of each row at 0.
+    """
+
+    scores: Tensor
+
+    def __init__(self, size: int) -> None:
+        """Draw ``size`` items, by the scores that `proba_distribution` is given."""
+        super().__init__()
+        self.size = size
+
+    def proba_distribution_net(self) -> nn.Module:
+        """Return the module from scores to parameters of the distribution, which are the same."""
+        return nn.Identity()
+
+    def proba_distribution(self, scores: Tensor) -> PlackettLuce:
+        """Take the scores, shape (k, n), and return the distribution.
+
+        Raises:
+            ValueError: B is not in 1..n, or a score is not finite.
+        """
+        n = scores.shape[-1]
+        if not 1 <= self.size <= n:
+            raise ValueError(f"size must be in 1..{n}, got {self.size}")
+        if not bool(torch.isfinite(scores).all()):
+            raise ValueError("scores must be finite; a diverged training makes them NaN")
+        # Only differences matter. Centred scores are at most 0, so no exponential overflows, and
+        # neither do sums of a few of the lowest scores.
+        centred = scores - scores.amax(dim=-1, keepdim=True).detach()
+        self.scores = centred.clamp_min(torch.finfo(scores.dtype).min / (4 * n))
+        return self
+
+    def sample(self) -> Tensor:
+        """Return ordered sets drawn at random, shape (k, B)."""
+        # Minus the logarithm of a standard exponential is a standard Gumbel variable.
+        exponential = torch.empty_like(self.scores).exponential_()
+        noise = -exponential.clamp_min(torch.finfo(exponential.dtype).tiny).log()
+        return self._largest(self.scores.detach() + noise)
+
+    def mode(self) -> Tensor:
+        """Return the most probable ordered sets, shape (k, B); ties go upstream."""
+        return self._largest(self.scores.detach())
+
+    def log_prob(self, actions: Tensor) -> Tensor:
+        """Return the log-probabilities of ordered sets (k, B), shape (k,).
+
+        That of a set in which an item appears twice is minus infinity.
+
+        Raises:
+            ValueError: The shape is not (k, B).
+            RuntimeError: An index is out of range.
+        """
+        expected = (len(self.scores), self.size)
+        if actions.shape != expected:
+            raise ValueError(f"actions must have shape {expected}, got {tuple(actions.shape)}")
+        item, *others = actions.long().split(1, dim=1)
+        logs = self._first
+        total = logs.gather(1, item)
+        for other in others:
+            logs = logs.scatter(1, item, -torch.inf).log_softmax(dim=1)
+            total, item = total + logs.gather(1, other), other
+        return total[:, 0]
+
+    def entropy(self) -> Tensor:
+        """Return B times the entropy of the first draw, shape (k,): the entropy for B = 1."""
+        logs = self._first
+        return -self.size * (logs.exp() * logs).sum(dim=1)
+
+    def actions_from_params(self, scores: Tensor, deterministic: bool = False) -> Tensor:
+        """Return the most probable ordered sets of scores (k, n), or drawn ones, shape (k, B)."""
+        return self.proba_distribution(scores).get_actions(deterministic)
+
+    def log_prob_from_params(self, scores: Tensor) -> tuple[Tensor, Tensor]:
+        """Return ordered sets drawn by scores (k, n), and their log-probabilities (k,)."""
+        actions = self.actions_from_params(scores)
+        return actions, self.log_prob(actions)
+
+    @property
+    def _first(self) -> Tensor:
+        """Log-probabilities of the first draw, (k, n)."""
+        return self.scores.log_softmax(dim=1)
+
+    def _largest(self, keys: Tensor) -> Tensor:
+        if self.size == 1:
+            return keys.argmax(dim=1, keepdim=True)
+        return keys.argsort(dim=1, descending=True, stable=True)[:, : self.size]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A channel of the observation, with a value for each mainline segment.
+
+    Attributes:
+        name: Kind of segment and observation block, such as ``"off-ramp density"``.
+        source: Index into the observation for each of the n segments; None where there is no
+            value, and the channel is 0.
+        centre: Subtracted from the values.
+        scale: Divides the centred values.
+    """
+
+    name: str
+    source: tuple[int | None, ...]
+    centre: float
+    scale: float
+
+
+@dataclass(frozen=True)
+class RoadChannels:
+    """Layout of an observation along the road, as plain data that travels with a policy.
+
+    A ramp's values are assigned to the segment that it joins or leaves: an on-ramp at face j to
+    segment j, downstream of the face, an off-ramp to segment j - 1. The bandwidth and epsilon are
+    left out: they are constant during a training, so their weights would remain untrained and
+    would harm the policy elsewhere. Their effect shows in the deviations and ages.
+
+    Attributes:
+        n_mainline: Segments n along the road.
+        size: Length of an observation.
+        channels: The channels with values from the observation.
+        marks: Constant channels of 0 or 1 per segment, for on-ramps, off-ramps and fixed sensors.
+    """
+
+    n_mainline: int
+    size: int
+    channels: tuple[Channel, ...]
+    marks: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def from_config(cls, config: EnvConfig) -> RoadChannels:
+        """Return the layout of the observations of an environment of ``config``.
+
+        Raises:
+            ValueError: Queries are not of single segments at one price level.
+        """
+        if not config.queries.are_segments:
+            raise ValueError(
+                "a policy whose network is shared by all segments needs query_spans (1,) and one "
+                f"price level, got {config.queries}"
+            )
+        corridor, n = config.corridor, config.corridor.n_mainline
+        encoding = make_interface(config).observations
+        starts = {name: place.start for name, place in encoding.slices.items()}
+        released = [name for name in starts if name.startswith("released_")]
+        prices = [name for name in PRICE_BLOCKS if name in starts]
+        # Of a ramp with several segments, the one that touches the mainline.
+        on_ramps = zip(corridor.on_ramp_segments, corridor.on_ramps, strict=True)
+        off_ramps = zip(corridor.off_ramp_segments, corridor.off_ramps, strict=True)
+        joins = {segments[-1]: face for segments, face in on_ramps}
+        leaves = {segments[0]: face - 1 for segments, face in off_ramps}
+        channels = [
+            _channel(name, starts, {i: i for i in range(n)}, n, "mainline")
+            for name in (*MAINLINE_BLOCKS, *released, *prices)
+        ]
+        fixed = {s: k for k, s in enumerate(corridor.fixed_sensors)}
+        for kind, ramps in (("on-ramp", joins), ("off-ramp", leaves)):
+            channels += [
+                _channel(name, starts, {at: s for s, at in ramps.items()}, n, kind)
+                for name in RAMP_BLOCKS
+            ]
+            watched = {at: fixed[s] for s, at in ramps.items() if s in fixed}
+            if watched:
+                channels += [
+                    _channel(name, starts, watched, n, kind) for name in FIXED_SENSOR_BLOCKS
+                ]
+        marks = [joins.values(), leaves.values(), [s for s in fixed if s < n]]
+        return cls(
+            n_mainline=n,
+            size=int(encoding.space.shape[0]),
+            channels=tuple(channels),
+            marks=tuple(tuple(float(i in places) for i in range(n)) for places in marks),
+        )
+
+    @property
+    def sensor_mark(self) -> tuple[float, ...]:
+        """Marks of 0 or 1 per segment: whether it has a fixed sensor."""
+        return self.marks[-1]
+
+    def index(self, block: str) -> int:
+        """Return the index of the mainline channel of an observation block.
+
+        Raises:
+            ValueError: The block has no mainline channel.
+        """
+        names = [channel.name for channel in self.channels]
+        if f"mainline {block}" not in names:
+            known = ", ".join(name[9:] for name in names if name.startswith("mainline "))
+            raise ValueError(f"observation block must be one of {known}, got {block!r}")
+        return names.index(f"mainline {block}")
+
+
+def _channel(
+    block: str, starts: Mapping[str, int], offsets: Mapping[int, int], n: int, kind: str
+) -> Channel:
+    """Make a channel; ``offsets`` maps a segment to the position of its value in the block."""
+    centre, scale = CENTRES[block]
+    source = tuple(starts[block] + offsets[i] if i in offsets else None for i in range(n))
+    return Channel(f"{kind} {block}", source, centre, scale)
+
+
+# Names of parameters below are those of the weights in saved policies.
+
+
+class RoadFeatures(nn.Module):
+    """Arranges observations (k, size) as scaled channels along the road (k, n, n_channels).
+
+    To the channels of `RoadChannels` it adds the logarithms of age, of speed and of how much the
+    speeds of the neighbours differ, which is large at a front of a jam; then the marks; then the
+    place p on the road, from -1 to 1, and p^2.
+    """
+
+    source: Tensor
+    centre: Tensor
+    factor: Tensor
+    fixed: Tensor
+
+    def __init__(self, road: RoadChannels) -> None:
+        """Store the position of each value in an observation; nothing here is learned or saved."""
+        super().__init__()
+        n, size = road.n_mainline, road.size
+        centre, factor = torch.zeros(size), torch.zeros(size)
+        for channel in road.channels:
+            at = [place for place in channel.source if place is not None]
+            centre[at], factor[at] = channel.centre, 1.0 / channel.scale
+        derived = torch.arange(size, size + 3 * n).reshape(3, n)
+        padding = size + 3 * n  # of a zero after both
+        source = [[padding if at is None else at for at in c.source] for c in road.channels]
+        place = torch.linspace(-1.0, 1.0, n)
+        fixed = torch.stack([*torch.tensor(road.marks), place, place**2], dim=1)
+        self.n_channels = len(road.channels) + 3 + fixed.shape[1]
+        self._age, self._speed = (
+            slice(at := road.channels[road.index(name)].source[0], at + n)
+            for name in ("age", "speed")
+        )
+        columns = torch.cat([torch.tensor(source), derived]).T.flatten()
+        self.register_buffer("source", columns, persistent=False)
+        self.register_buffer("centre", centre, persistent=False)
+        self.register_buffer("factor", factor, persistent=False)
+        self.register_buffer("fixed", fixed, persistent=False)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the channels (k, n, n_channels) of observations (k, size)."""
+        k, n = len(observation), len(self.fixed)
+        age, speed = observation[:, self._age], observation[:, self._speed]
+        ends = torch.cat([speed[:, :1], speed, speed[:, -1:]], dim=1)
+        front = (ends[:, 2:] - ends[:, :-2]).abs()
+        values = torch.cat(
+            [
+                (observation - self.centre) * self.factor,
+                (60.0 * age.clamp_min(0.0) + 1.0).log() - 1.5,
+                (front + 0.02).log() + 2.5,
+                (speed.clamp_min(0.0) + 0.3).log(),
+                observation.new_zeros(k, 1),
+            ],
+            dim=1,
+        )
+        along = values.index_select(1, self.source).view(k, n, -1)
+        return torch.cat([along, self.fixed.expand(k, -1, -1)], dim=2)
+
+
+class Trunk(nn.Module):
+    """Two convolutions along the road; the second also sees the first's mean over the road.
+
+    They are products of matrices, which are faster than convolutions of so few segments.
+    """
+
+    def __init__(self, n_channels: int, width: int, reach: int) -> None:
+        """Make a trunk of ``width`` features per segment, of ``reach`` neighbours either side."""
+        super().__init__()
+        self.reach = reach
+        self.near = nn.Linear((2 * reach + 1) * n_channels, width)
+        self.far = nn.Linear((2 * reach + 1) * width, width)
+        self.whole = nn.Linear(width, width, bias=False)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Return features (k, n, width) of the `windows` of channels."""
+        near = torch.relu(self.near(windows))
+        mean = self.whole(near.mean(dim=1))
+        return torch.relu(self.far(make_windows(near, self.reach)) + mean[:, None])
+
+
+def make_windows(channels: Tensor, reach: int) -> Tensor:
+    """Return for each segment the channels (k, n, c) of itself and of its neighbours.
+
+    The shape is (k, n, (2 reach + 1) c); beyond the ends of the road they are 0.
+    """
+    n = channels.shape[1]
+    padded = nn.functional.pad(channels, (0, 0, reach, reach))
+    return torch.cat([padded[:, i : i + n] for i in range(2 * reach + 1)], dim=2)
+
+
+class Scorer(nn.Module):
+    """The actor: scores each segment by a rule linear in its channels plus features of a trunk."""
+
+    def __init__(self, n_channels: int, width: int, reach: int) -> None:
+        """Make a scorer that begins nearly indifferent."""
+        super().__init__()
+        self.trunk = Trunk(n_channels, width, reach)
+        self.rule = nn.Linear(n_channels, 1, bias=False)
+        self.correction = nn.Linear(width, 1, bias=False)
+        nn.init.zeros_(self.rule.weight)
+        # Small rather than zero, which would keep the trunk's gradient at zero at first.
+        with torch.no_grad():
+            self.correction.weight *= 0.1
+
+    def forward(self, channels: Tensor, windows: Tensor) -> Tensor:
+        """Return scores (k, n) of channels (k, n, c) and their `windows`."""
+        scores: Tensor = self.rule(channels) + self.correction(self.trunk(windows))
+        return scores[..., 0]
+
+
+class Critic(nn.Module):
+    """Values of observations: the mean and the largest of a trunk's features over the road."""
+
+    def __init__(self, n_channels: int, width: int, reach: int) -> None:
+        """Make a critic of ``width`` features per segment."""
+        super().__init__()
+        self.trunk = Trunk(n_channels, width, reach)
+        self.head = nn.Sequential(
+            nn.Linear(2 * width, 4 * width), nn.ReLU(), nn.Linear(4 * width, 1)
+        )
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Return values (k, 1) of the `windows` of channels."""
+        features = self.trunk(windows)
+        value: Tensor = self.head(torch.cat([features.mean(dim=1), features.amax(dim=1)], dim=1))
+        return value
+
+
+class RoadPolicy(ActorCriticPolicy):
+    """Scores every mainline segment by one network and queries by `PlackettLuce`.
+
+    Weights are shared by all segments, so one network acts on roads of any size with any bandwidth.
+    Actions are those of the encoding ``slots``; they never repeat a segment. Observations are
+    scaled by constants of the channels: leave ``norm_obs`` of ``VecNormalize`` off. ``dptse train``
+    trains it by PPO, or its scores by regression and swaps. With stable-baselines3 alone::
+
+        PPO(RoadPolicy, SB3VecEnv(env), policy_kwargs=RoadPolicy.kwargs(env))
+
+    Attributes:
+        bandwidth: B, queries a step.
+        road: Layout of the observations.
+        sizes: Arguments other than the layout: ``width``, ``critic_width``, ``reach`` and
+            ``skips_sensors``, which leaves segments with a fixed sensor to that sensor, since it
+            tells every second what a query would, as long as there are others to query.
+        features: Module that arranges observations along the road.
+        scorer: Module that scores segments; it has all weights that actions depend on.
+        critic: Module that estimates values.
+    """
+
+    handicap: Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule = BasePolicy._dummy_schedule,
+        *,
+        road: RoadChannels,
+        width: int = 32,
+        critic_width: int = 16,
+        reach: int = 1,
+        skips_sensors: bool = True,
+        **more: Any,
+    ) -> None:
+        """Make the network.
+
+        Args:
+            observation_space: Flat observations of ``road.size`` numbers.
+            action_space: ``MultiDiscrete([n] * B)``, of the encoding ``slots``.
+            lr_schedule: Learning rate of the optimizer; none where another one trains the weights.
+            road: Layout of the observations, `RoadChannels.from_config` of the environment's
+                configuration.
+            width: Features per segment of the actor.
+            critic_width: Features per segment of the critic.
+            reach: Neighbours on either side that each of two convolutions sees.
+            skips_sensors: Whether segments with a fixed sensor come last.
+            **more: Further arguments of the base class, such as ``optimizer_class``.
+
+        Raises:
+            ValueError: A space does not fit ``road``.
+        """
+        self.bandwidth = _bandwidth(observation_space, action_space, road)
+        self.road = road
+        self.sizes = {
+            "width": width, "critic_width": critic_width, "reach": reach,
+            "skips_sensors": skips_sensors,
+        }  # fmt: skip
+        super().__init__(observation_space, action_space, lr_schedule, **more)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        """Make the modules and the optimizer; called by the base class."""
+        mark = torch.tensor(self.road.sensor_mark)
+        last = LAST_PLACE * mark if self.sizes["skips_sensors"] else torch.zeros(())
+        self.register_buffer("handicap", last, persistent=False)
+        self.features = RoadFeatures(self.road)
+        n_channels, reach = self.features.n_channels, self.sizes["reach"]
+        self.scorer = Scorer(n_channels, self.sizes["width"], reach)
+        self.critic = Critic(n_channels, self.sizes["critic_width"], reach)
+        self.action_dist = PlackettLuce(self.bandwidth)
+        self.optimizer = self.optimizer_class(
+            self.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    @classmethod
+    def kwargs(cls, env: Any) -> dict[str, Any]:
+        """Return the ``policy_kwargs`` of an algorithm for an environment: its road.
+
+        Args:
+            env: Of this package, scalar or vector, wrapped or not, or as an `SB3VecEnv`.
+
+        Raises:
+            ValueError: Another environment, or queries of more than single segments.
+        """
+        return {"road": RoadChannels.from_config(config_of(env))}
+
+    @classmethod
+    def from_config(cls, config: EnvConfig, **arguments: Any) -> RoadPolicy:
+        """Make a policy for the environments of ``config``, whose actions are ``slots``.
+
+        Args:
+            config: Configuration of the environment.
+            **arguments: As those of the class.
+
+        Raises:
+            ValueError: Another encoding of actions, or queries of more than single segments.
+        """
+        interface = make_interface(config)
+        spaces = interface.observations.space, interface.actions.space
+        return cls(*spaces, road=RoadChannels.from_config(config), **arguments)
+
+    def sharing(self, config: EnvConfig) -> RoadPolicy:
+        """Return a policy for another environment that has the very same weights.
+
+        A training that moves them moves both policies.
+
+        Raises:
+            ValueError: The environment's actions do not fit, or its channels differ.
+        """
+        twin = RoadPolicy.from_config(config, **self.sizes)
+        names, own = ([channel.name for channel in each.road.channels] for each in (twin, self))
+        if names != own:
+            missing, more = sorted(set(own) - set(names)), sorted(set(names) - set(own))
+            raise ValueError(
+                f"environments must have the same channels to share a network; one lacks "
+                f"{missing} and has {more} besides"
+            )
+        twin.scorer, twin.critic = self.scorer, self.critic
+        return twin
+
+    def scores(self, observation: Tensor) -> Tensor:
+        """Return the scores (k, n) of observations (k, size)."""
+        scores: Tensor = self.scorer(*self._seen(observation))
+        return scores
+
+    def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Return actions (k, B), values (k, 1) and log-probabilities (k,)."""
+        channels, windows = self._seen(obs)
+        sets = self._sets(self.scorer(channels, windows))
+        actions = sets.get_actions(deterministic)
+        return actions, self.critic(windows), sets.log_prob(actions)
+
+    def evaluate_actions(
+        self, obs: PyTorchObs, actions: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return values (k, 1), log-probabilities of actions (k, B), and entropies, (k,) each."""
+        channels, windows = self._seen(obs)
+        sets = self._sets(self.scorer(channels, windows))
+        return self.critic(windows), sets.log_prob(actions), sets.entropy()
+
+    def predict_values(self, obs: PyTorchObs) -> Tensor:
+        """Return values (k, 1) of observations (k, size)."""
+        values: Tensor = self.critic(self._seen(obs)[1])
+        return values
+
+    def get_distribution(self, obs: PyTorchObs) -> PlackettLuce:
+        """Return the distribution over ordered sets for observations (k, size)."""
+        return self._sets(self.scorer(*self._seen(obs)))
+
+    def _seen(self, observation: PyTorchObs) -> tuple[Tensor, Tensor]:
+        """Return the channels (k, n, c) and their windows."""
+        assert isinstance(observation, Tensor)
+        channels = self.features(observation)
+        return channels, make_windows(channels, self.sizes["reach"])
+
+    def _sets(self, scores: Tensor) -> PlackettLuce:
+        return PlackettLuce(self.bandwidth).proba_distribution(scores - self.handicap)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
+            "road": self.road,
+            "optimizer_class": self.optimizer_class,
+            "optimizer_kwargs": self.optimizer_kwargs,
+            **self.sizes,
+        }
+
+
+def config_of(env: Any) -> EnvConfig:
+    """Return the configuration of an environment of this package, however it is wrapped.
+
+    Raises:
+        ValueError: Another environment.
+    """
+    base = env.unwrapped
+    config = getattr(base, "config", None) or getattr(getattr(base, "env", None), "config", None)
+    if not isinstance(config, EnvConfig):
+        raise ValueError(f"env must be an environment of this package, got {env}")
+    return config
+
+
+def _bandwidth(
+    observations: spaces.Space[Any], actions: spaces.Space[Any], road: RoadChannels
+) -> int:
+    """Return B of an action space, or refuse spaces that do not fit the layout."""
+    if observations.shape != (road.size,):
+        raise ValueError(
+            f"observation_space must have shape {(road.size,)}, as in road, got {observations}"
+        )
+    if (
+        not isinstance(actions, spaces.MultiDiscrete)
+        or actions.nvec.ndim != 1
+        or (actions.nvec != road.n_mainline).any()
+        or len(actions.nvec) > road.n_mainline
+    ):
+        raise ValueError(
+            f"action_space must be MultiDiscrete([{road.n_mainline}] * B) with B up to "
+            f"{road.n_mainline}, of action='slots'; got {actions}"
+        )
+    return len(actions.nvec)
