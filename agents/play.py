@@ -13,7 +13,7 @@ from typing import Any
 from filelock import FileLock
 
 from agents.environments import make_config, make_vector, quietly
-from agents.policies import NamedSchedule, SavedPolicy, find_policy
+from agents.policies import NamedSchedule, find_policy
 from agents.watchers import WATCHERS
 from dptse_env.estimators.recurrent import member_for, read_network, shipped_networks
 from dptse_env.evaluation import Row, evaluate
@@ -40,7 +40,7 @@ class Cell:
         keywords: Keywords of ``gym.make`` as plain JSON, without traffic seeds and records.
         labels: Columns that tell the cell apart in tables: strings and numbers.
         noise_seed: Noise is seeded with this plus the traffic seed.
-        deterministic: Whether the policy takes its likeliest action; None: as its card says.
+        deterministic: Whether the policy takes its likeliest action.
         transferred: Whether the policy may act in an environment that it was not trained for.
         watchers: Names in `agents.watchers.WATCHERS`, which add columns to the rows.
         seeds: Traffic seeds in place of the study's.
@@ -51,7 +51,7 @@ class Cell:
     keywords: Mapping[str, Any] = field(default_factory=dict)
     labels: Mapping[str, Any] = field(default_factory=dict)
     noise_seed: int = 0
-    deterministic: bool | None = True
+    deterministic: bool = True
     transferred: bool = False
     watchers: tuple[str, ...] = ()
     seeds: tuple[int, ...] | None = None
@@ -120,9 +120,9 @@ def _with_digests(value: Any) -> Any:
         return {key: _with_digests(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [_with_digests(each) for each in value]
-    if value in shipped_networks():
-        return f"{value} sha256:{read_network(value).card['sha256']}"
     if isinstance(value, str):
+        if value in shipped_networks():
+            return f"{value} sha256:{read_network(value).card['sha256']}"
         members = dict.fromkeys(member_for(value, flows) for flows in (True, False))
         files = [member for member in members if Path(member).is_file()]
         return "+".join(f"sha256:{file_digest(file)}" for file in files) or value
@@ -152,11 +152,8 @@ def play(
     with quietly():
         env = make_vector(cell.env, len(seeds), {**cell.all_keywords, **more})
     record(env.config.corridor, seeds, records)
-    policy, source = cell.load_policy(env), find_policy(cell.policy)
-    deterministic = cell.deterministic
-    if deterministic is None:
-        deterministic = not isinstance(source, SavedPolicy) or source.card.get("acts") != "drawn"
-    if not isinstance(source, NamedSchedule):
+    policy = cell.load_policy(env)
+    if not isinstance(find_policy(cell.policy), NamedSchedule):
         import torch  # noqa: PLC0415 (schedules alone do without)
 
         torch.manual_seed(POLICY_SEED)
@@ -166,7 +163,7 @@ def play(
             policy,
             seeds,
             cell.noise_seed,
-            deterministic=deterministic,
+            deterministic=cell.deterministic,
             watchers=[WATCHERS[name] for name in cell.watchers],
         )
     except Exception as problem:

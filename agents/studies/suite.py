@@ -94,7 +94,6 @@ def _cell(
         env=env,
         keywords={"bandwidth": bandwidth, **every},
         noise_seed=SUITE.start,
-        deterministic=None,
         transferred=True,
         seeds=seeds,
     )
@@ -447,20 +446,30 @@ def _cell_table() -> str:
     )
 
 
+_LEAST = -0.5
+
+
 def draw_scores(scores: Scores, path: Path) -> None:
     """Save the scores of all policies but the references, dots by cell."""
     heights = {name: -k for k, name in enumerate(CELLS)}
     figure = make_figure(8.4, 1.7 + 0.34 * len(CELLS))
     axis = figure.subplots()
-    for k, policy in enumerate(name for name in scores if name not in (ZERO, ONE)):
-        values = [each.value for each in scores[policy].values()]
+    shown = {
+        policy: {name: each.value for name, each in found.items() if each.value > _LEAST}
+        for policy, found in scores.items()
+        if policy not in (ZERO, ONE)
+    }
+    for k, policy in enumerate(name for name, values in shown.items() if values):
+        values = shown[policy]
         marker = "D" if policy in shipped_policies() else "o^s"[k // 10 % 3]
-        places = [heights[name] for name in scores[policy]]
-        axis.plot(values, places, marker, color=f"C{k % 10}", label=policy, markersize=5)
+        places = [heights[name] for name in values]
+        axis.plot(
+            list(values.values()), places, marker, color=f"C{k % 10}", label=policy, markersize=5
+        )
     for place in (0.0, 1.0):
         axis.axvline(place, color=GREY, linewidth=0.8)
-    axis.set_xlim(-0.5, 1.05)
-    axis.set_xlabel("score, those below -0.5 left out")
+    axis.set_xlim(_LEAST, 1.05)
+    axis.set_xlabel(f"score, those below {_LEAST} left out")
     axis.set_yticks(list(heights.values()), list(heights))
     title = f"{NAME}: 0 is the round robin, 1 the gain oracle"
     save_figure(finish_figure(figure), path, title)

@@ -16,7 +16,6 @@ from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, 
 from dptse_env.estimators.recurrent import read_network
 from tests.agents.faults import SHORT, TRACES, rows_of, study
 from tests.helpers import save_untrained
-from tests.hostile import edited
 
 ROOT = Path(__file__).parents[2]
 KEYWORDS = {"estimator": "random_walk", "horizon": 80}
@@ -138,18 +137,6 @@ def test_an_id_says_all_that_rows_depend_on(tmp_path):
     # A network of the package by its own name goes with its digest.
     keywords = {"estimator_settings": {"recurrent": {"weights": "highway-flows"}}}
     assert read_network("highway-flows").card["sha256"] in replace(first, keywords=keywords).id
-
-
-def test_a_saved_policy_acts_as_its_card_says_unless_told(tmp_path):
-    path = save_untrained(tmp_path / "policy.safetensors", estimator="random_walk")
-    acting = {}
-    for acts in ("deterministic", "drawn"):
-        path.write_bytes(edited(path, lambda card, _, acts=acts: card.update(acts=acts)))
-        for told in (None, True, False):
-            one = replace(cell(2), policy=str(path), deterministic=told)
-            acting[acts, told] = play(one, (2000,))[0]["reward"]
-        assert acting[acts, None] == acting[acts, acts == "deterministic"]
-    assert acting["drawn", True] != acting["drawn", False]
 
 
 def test_pairs_are_of_one_version():
