@@ -22,6 +22,7 @@ from agents.policies import policy_name
 from agents.studies import suite
 from agents.study import Study, play_study
 from agents.terminal import make_table, print_table
+from dptse_env.utils.fields import require
 from scripts.cli import Machines
 
 CARD = "card.json"
@@ -31,58 +32,66 @@ CARD = "card.json"
 class Args(Machines):
     """Score a query policy in the cells of the query suite, and write its card."""
 
-    policy: tyro.conf.Positional[str]
-    """A schedule; a saved policy by file or shipped name, or "module:Class"."""
+    policies: tyro.conf.Positional[tuple[str, ...]]
+    """Schedules; saved policies by file or shipped name; "module:Class". Where there are several,
+    the first that suits a cell acts in it."""
     beside: tuple[Path, ...] = ()
     """Cards of other policies, to be shown beside it."""
     output: Path | None = None
-    """Folder of the card and the rows; results/my-suite/POLICY if not given."""
+    """Folder of the card and the rows; one below results/my-suite if not given."""
 
 
 def main(args: Args) -> None:
-    """Play the policy in the cells that it suits, write its card, and print scores."""
-    name = policy_name(args.policy)
+    """Play what was entered, write its card, and print scores."""
+    require(bool(args.policies), "policies", "one or more", args.policies)
     others = [suite.read_card(path) for path in args.beside]
     recorded = suite.recorded_rows()
-    cells = suitable(
-        [suite.make_cell(each, name, args.policy) for each in suite.CELLS], args.policy
-    )
+    cells = enter(args.policies)
+    (entry,) = {each.labels["policy"] for each in cells}
     # A schedule by "module:Class" has a character that not every system allows in a path.
-    folder = args.output or Path("results/my-suite") / name.replace(":", "-")
+    folder = args.output or Path("results/my-suite") / entry.replace(":", "-")
     study = Study("suite", cells, suite.SEEDS, lambda rows, folder: "")
     played = play_study(study, args.place(folder))
-    # The folder may have rows of other policies, and of an earlier state of this one's file.
-    own = played.filter(
-        pl.col("cell").is_in([each.id for each in cells]), version=dptse_env.__version__
-    )
+    # The folder may have rows of other policies, of an earlier state of this one's file, and of
+    # this one under another name.
+    present = pl.col("cell").is_in([each.id for each in cells])
+    own = played.filter(present, version=dptse_env.__version__).with_columns(policy=pl.lit(entry))
     rows: pl.DataFrame = pl.concat([recorded, *others, own], how="diagonal_relaxed")
     rows = rows.unique(("version", "policy", "name", "traffic_seed"), keep="last")
-    write_json(folder / CARD, suite.make_card(rows, name, args.policy))
-    print_scores(rows, [name, *(each["policy"][0] for each in others)])
+    write_json(folder / CARD, suite.make_card(rows, entry, cells))
+    print_scores(rows, [entry, *(each["policy"][0] for each in others)])
     print(f"the card is {folder / CARD}")
 
 
-def suitable(cells: Sequence[Cell], what: str) -> tuple[Cell, ...]:
-    """Return the cells that can be played, and say how many do not suit what was given, and why.
+def enter(policies: Sequence[str]) -> tuple[Cell, ...]:
+    """Return the cells with the first policy that suits each, and say which are left out, and why.
 
     Raises:
         FileNotFoundError: There is no such policy.
-        ValueError: None can be played.
+        ValueError: One of the policies acts in no cell.
     """
-    taken, refused = [], []
-    for cell in cells:
-        try:
-            cell.check()
-        except ValueError as problem:
-            refused.append(problem)
-        else:
-            taken.append(cell)
-    if not taken:
-        raise refused[0]
-    if refused:
-        n = f"{len(refused)} of {len(cells)} cells"
-        print(f"{n} do not suit {what} and are left out: {refused[0]}", file=sys.stderr)
-    return tuple(taken)
+    entry = "+".join(map(policy_name, policies))
+    reasons = dict.fromkeys(policies, "those before it act in all cells")
+    found, left_out = {}, {}
+    for name in suite.CELLS:
+        for source in policies:
+            cell = suite.make_cell(name, entry, source)
+            try:
+                cell.check()
+            except ValueError as problem:
+                left_out[name] = reasons[source] = str(problem)
+            else:
+                found[name] = cell
+                break
+    acting = {cell.policy for cell in found.values()}
+    idle = [source for source in policies if source not in acting]
+    if idle:
+        raise ValueError(f"{idle[0]!r} acts in no cell: {reasons[idle[0]]}")
+    missing = [name for name in suite.CELLS if name not in found]
+    if missing:
+        names = ", ".join(missing)
+        print(f"{entry} does not suit {names}: {left_out[missing[0]]}", file=sys.stderr)
+    return tuple(found.values())
 
 
 def print_scores(rows: pl.DataFrame, policies: Sequence[str]) -> None:

@@ -26,7 +26,7 @@ import dptse_env
 from agents.environments import make_config, quietly
 from agents.figures import GREY, finish_figure, make_figure, save_figure
 from agents.play import Cell
-from agents.policies import find_policy
+from agents.policies import find_policy, policy_name
 from agents.seeds import SUITE
 from agents.statistics import Interval
 from agents.studies.roads.own import OWN_ROADS
@@ -48,7 +48,7 @@ from agents.tables import (
 from dptse_env.config import parse_seeds
 from dptse_env.parts import privacy_report
 from dptse_env.policies import shipped_policies
-from dptse_env.utils.fields import parse_json
+from dptse_env.utils.fields import number, parse_json, require
 
 NAME = "query-suite-v3"
 """Changes with anything that a score depends on."""
@@ -299,19 +299,27 @@ def comparable() -> dict[str, str]:
     return {"suite": NAME, "package": dptse_env.__version__, "cells": digest}
 
 
-def make_card(rows: pl.DataFrame, policy: str, source: str) -> dict[str, Any]:
+def make_card(rows: pl.DataFrame, policy: str, cells: Sequence[Cell]) -> dict[str, Any]:
     """Return the card of a policy.
 
     Args:
         rows: Rows of the policy and of both references.
-        policy: Name of the policy in tables.
-        source: What `agents.policies.find_policy` takes.
+        policy: Its name in tables.
+        cells: What was played, see `make_cell`.
     """
-    scores = score_all(rows).get(policy, {})
+    scores = score_all(rows)[policy]
     everywhere = len(scores) == len(CELLS)
+    played = {
+        str(each.labels["name"]): {
+            "name": policy_name(each.policy),
+            "identity": find_policy(each.policy).identity,
+        }
+        for each in cells
+    }
     return {
         **comparable(),
-        "policy": {"name": policy, "identity": find_policy(source).identity},
+        "policy": policy,
+        "policies": played,
         "score": _plain(mean_score(list(scores.values()))) if everywhere else None,
         "scores": {name: _plain(mean_score([each])) for name, each in scores.items()},
         "errors": {
@@ -331,7 +339,7 @@ def _plain(interval: Interval) -> dict[str, float]:
 
 
 def read_card(path: Path) -> pl.DataFrame:
-    """Return the errors of a card as rows of a policy that is named after its file, too.
+    """Return the errors of a card as rows of a policy, which has the file in its name.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -340,36 +348,25 @@ def read_card(path: Path) -> pl.DataFrame:
     if not path.is_file():
         raise FileNotFoundError(f"{path} is not there")
     card = parse_json(path.read_text(encoding="utf-8"), str(path))
-    if not isinstance(card, dict) or not comparable().keys() <= card.keys():
+    if not isinstance(card, dict) or not {*comparable(), "policy", "errors"} <= card.keys():
         raise ValueError(f"{path} must be a card that 'dptse suite' wrote")
-    for name, own in comparable().items():
-        if card[name] != own:
+    for key, own in comparable().items():
+        if card[key] != own:
             raise ValueError(
-                f"{path} cannot be compared: its {name} is {card[name]!r:.80}, here it is {own!r}"
+                f"{path} cannot be compared: its {key} is {card[key]!r:.80}, here it is {own!r}"
             )
-    try:
-        policy = f"{card['policy']['name']} ({path})"
-        rows = [
-            {"version": card["package"], **_labels(policy, name), "traffic_seed": int(seed),
-             "reward": float(error) / -1000.0}
-            for name, errors in card["errors"].items()
-            for seed, error in errors.items()
-        ]  # fmt: skip
-    except (KeyError, TypeError, ValueError, AttributeError) as problem:
-        raise ValueError(f"{path} must be a card that 'dptse suite' wrote: {problem!r}") from None
-    seeds: dict[str, list[int]] = {}
-    for row in rows:
-        seeds.setdefault(row["name"], []).append(row["traffic_seed"])
-        if not math.isfinite(row["reward"]):
-            raise ValueError(
-                f"{path} must have finite errors, got {row['reward']} in {row['name']}"
-            )
-    for name, played in seeds.items():
-        if name not in CELLS or sorted(played) != sorted(CELLS[name].seeds or ()):
-            raise ValueError(
-                f"{path} must have errors of the seeds of a cell, has others: {name!r}"
-            )
-    return pl.DataFrame(rows)
+    policy, errors, rows = f"{card['policy']} ({path})", card["errors"], []
+    require(isinstance(errors, dict) and bool(errors), f"{path}: errors", "by cell", errors)
+    for name, by_seed in errors.items():
+        seeds = [str(seed) for seed in CELLS[name].seeds or ()] if name in CELLS else []
+        allowed = "numbers of all traffic seeds of a cell"
+        fits = isinstance(by_seed, dict) and seeds and sorted(by_seed) == sorted(seeds)
+        require(bool(fits), f"{path}: errors[{name!r}]", allowed, by_seed)
+        for seed in seeds:
+            error = number(float, by_seed[seed], f"{path}: errors[{name!r}][{seed!r}]", None)
+            labels = _labels(policy, name)
+            rows.append({**labels, "traffic_seed": int(seed), "reward": -error / 1000.0})
+    return pl.DataFrame(rows).with_columns(version=pl.lit(dptse_env.__version__))
 
 
 # The report on all that comes with the package.

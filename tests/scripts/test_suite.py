@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from dptse_env.policies import read_policy
 from tests.agents.studies.test_suite import SMALL, recorded, small  # noqa: F401 (fixtures)
 from tests.helpers import save_untrained
 from tests.scripts.commands import refused, run_command
@@ -23,15 +24,20 @@ def test_a_policy_gets_a_card_and_its_scores_beside_another_card(tmp_path):
     assert f"{card['score']['mean']:.2f} ±" in line
 
 
-def test_cells_that_a_policy_does_not_suit_are_left_out(tmp_path):
+def test_the_first_policy_that_suits_a_cell_acts_in_it(tmp_path):
     saved = save_untrained(tmp_path / "run" / "best.safetensors", estimator="random_walk")
-    done = run_command("suite", saved, "--output", tmp_path / "out", "--workers", "1")
+    words = "--output", tmp_path / "out", "--workers", "1"
+    done = run_command("suite", saved, *words)
+    assert "run/best does not suit paced: policy" in done.stderr
+    card = json.loads((tmp_path / "out" / "card.json").read_text())
+    assert (card["scores"].keys(), card["score"]) == ({"plain"}, None)
+    done = run_command("suite", saved, "static", *words)
     assert done.returncode == 0, done.stderr
     card = json.loads((tmp_path / "out" / "card.json").read_text())
-    assert "1 of 2 cells do not suit" in done.stderr
-    assert (card["scores"].keys(), card["score"]) == ({"plain"}, None)
-    assert card["policy"]["name"] == "run/best"
-    assert len(card["policy"]["identity"]) == 64
+    assert card["score"] is not None
+    acting = {name: each["name"] for name, each in card["policies"].items()}
+    assert acting == {"plain": "run/best", "paced": "static"}
+    assert card["policies"]["plain"]["identity"] == read_policy(saved).card["sha256"]
 
 
 @pytest.mark.parametrize(
@@ -39,7 +45,9 @@ def test_cells_that_a_policy_does_not_suit_are_left_out(tmp_path):
     [
         (("nobody.safetensors",), "nobody.safetensors"),
         (("nobody",), "'nobody'"),
+        (("static", "nobody"), "'nobody' acts in no cell"),
         (("static", "--beside", "nobody.json"), "nobody.json"),
+        ((), "policies must be one or more"),
     ],
 )
 def test_bad_input_is_named_before_anything_is_played(words, message, tmp_path):
