@@ -89,7 +89,7 @@ format: setup  ## Format the code.
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-benchmark: setup  ## Time estimators, environments and long roads beside their peers; results/benchmarks.
+benchmark: setup  ## Time estimators, environments, learning and long roads; results/benchmarks.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[benchmark]'
 	$(BIN)/python -m benchmarks --output results/benchmarks/tables.md
 

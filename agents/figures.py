@@ -242,6 +242,7 @@ LABELS = {
     "random_walk": "random walk",
     "blend": "EKF and random walk",
     "asm": "adaptive smoothing",
+    "mixture": "mixture",
     "recurrent": "recurrent",
     "open_loop": "open loop",
 }

@@ -1,4 +1,4 @@
-"""Times of a step: estimators, environments and long roads beside their peers.
+"""Times of a step: estimators, environments, learning and long roads beside their peers.
 
 python -m benchmarks --parts estimators
 
@@ -21,7 +21,7 @@ from benchmarks.turns import HEADER, Line, as_cells, measure, show
 from dptse_env.utils.threads import n_cores
 from scripts.cli import run
 
-Part = Literal["estimators", "environment", "long_roads"]
+Part = Literal["estimators", "environment", "learning", "long_roads"]
 PACKAGES = ("dptse-env", "libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
 
 

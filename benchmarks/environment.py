@@ -16,14 +16,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
-from stable_baselines3 import PPO
 
 from benchmarks.turns import Line, Work, compare, make_batch, stepping, take_turns
 from dptse_env.config import resolve
 from dptse_env.parts import make_task
 from dptse_env.release.noise import Noise, NoiseSource
-from dptse_env.sb3 import SB3VecEnv
 from dptse_env.traffic import RecordLibrary, draw_scenario
 from dptse_env.traffic.sumo import running
 from dptse_env.traffic.sumo import seconds as seconds_of
@@ -34,7 +31,6 @@ PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHigh
 
 def measure(*, quick: bool = False) -> list[Line]:
     """Return the lines of all environments; the ratios are to the largest batch on one thread."""
-    torch.set_num_threads(1)
     n, steps, rounds = (2, 2, 2) if quick else (1024, 16, 10)
     keywords = {"traffic_seeds": "0:2" if quick else "0:64", "horizon": 600, "random_start": True}
     with tempfile.TemporaryDirectory() as folder:
@@ -57,7 +53,6 @@ def measure(*, quick: bool = False) -> list[Line]:
         )
         for source in ("seeded", "secure"):
             work[f"{source} noise, batch of {n:,}, PrivateHighway"] = noise(source, n, steps)
-        work[f"PPO, batch of {n:,}"] = learning(n, steps, keywords)
         times = take_turns(work, rounds)
     base = f"batch of {n:,}"
     return compare(times, {name: base for name in times if name != base})
@@ -166,18 +161,5 @@ def noise(source: NoiseSource, n: int, n_steps: int) -> Work:
         for _ in range(n_steps):
             drawn.added(episodes, values, sigma, task.length)
         return n * n_steps
-
-    return turn
-
-
-def learning(n: int, n_steps: int, keywords: dict[str, Any]) -> Work:
-    """Return work that learns by PPO of stable-baselines3: a rollout and its updates."""
-    env = SB3VecEnv(make_batch(PAPER, n, autoreset_mode="SameStep", **keywords))
-    size = n * n_steps
-    model = PPO("MlpPolicy", env, n_steps=n_steps, batch_size=min(2048, size), seed=0, device="cpu")
-
-    def turn() -> int:
-        model.learn(size, reset_num_timesteps=False)
-        return size
 
     return turn

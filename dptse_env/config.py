@@ -86,7 +86,7 @@ class EnvConfig:
     Attributes:
         corridor: The road, its demand, incident and fixed sensors.
         estimator: The estimator: ``ekf``, ``ukf``, ``enkf``, ``mhe``, ``random_walk``,
-            ``blend``, ``open_loop``, ``recurrent``, ``asm``, a registered name,
+            ``blend``, ``open_loop``, ``recurrent``, ``asm``, ``mixture``, a registered name,
             ``"package.module:Class"``, or a class.
         backend: ``compiled``, or ``reference``, which EKF, UKF, EnKF and MHE have.
         parameters: ARZ parameters, or the name of a set.

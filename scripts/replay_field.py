@@ -23,7 +23,7 @@ from dptse_env.importers.fields import FieldSource
 from dptse_env.utils.fields import integer, parse_json, require
 
 ENV = "dptse_env:dptse/PaperHighway-v0"
-ESTIMATORS = ("ekf", "ukf", "random_walk", "blend", "asm", "recurrent")
+ESTIMATORS = ("ekf", "ukf", "random_walk", "blend", "asm", "recurrent", "mixture")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 r"""Train recurrent networks as an estimator, for releases of flows and of speeds.
 
-dptse train-estimator --seeds 0:1 --rounds ekf:2:4 own:2:4 --traffic 0:2 --validation 1000:1001 \
+dptse train-estimator --seeds 0:1 --rounds own:2:4 own:2:4 --traffic 0:2 --validation 1000:1001 \
     --plan '{"windows": 2, "ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}' \
     --output results/network
 
@@ -21,6 +21,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -42,6 +43,8 @@ from scripts.cli import Machines
 
 NAME = "network"
 """Name of the pair of networks in the output folder."""
+CONTINUED: dict[str, Any] = {"learning_rate": 1.5e-3, "teacher": 0.5}
+"""Fields of a plan that begins with trained networks."""
 GLANCE = 5.0
 """Time between two looks at the learning curves [s]."""
 
@@ -64,10 +67,11 @@ class Args(Machines):
     """Environments to validate in, with a round robin, beside sections of other highways."""
     validation: str = "1000:1008"
     """Traffic seeds to validate on, first:stop, of 1000 to 1999."""
-    rounds: tuple[str, ...] = ("ekf:96:300", "own:96:400", "own:96:600")
+    rounds: tuple[str, ...] = ("own:96:64",) * 7
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
-    initial: str | None = None
-    """Pair of networks to begin with, as the estimator takes it; rounds may then all be own."""
+    initial: str | None = "highway"
+    """Pair of networks to begin with, as the estimator takes it, which also teaches on ordinary
+    roads. None begins with random weights; the first round must then be another estimator's."""
     plan: str = "{}"
     """Further fields of the plan as JSON, such as '{"ranges": {"sections": 0.3}}'; see
     agents/filters/plan.py."""
@@ -111,6 +115,7 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
         width=FilterPlan.width if initial is None else read_network(initial).network.width,
         windows=min(FilterPlan.windows, len(traffic)),
         initial=initial,
+        **(CONTINUED if initial is not None else {}),
     )
     return from_mapping(FilterPlan, parse_json(args.plan, "plan"), "plan", plan)
 

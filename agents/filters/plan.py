@@ -125,7 +125,7 @@ class FilterPlan:
         Round(OWN, 96, 600),
     )
     width: Annotated[int, Interval(1, 512)] = 64
-    windows: Annotated[int, Interval(1, 24)] = 8
+    windows: Annotated[int, Interval(1, 24)] = 16
     episodes: Annotated[int, Interval(1, 10_000)] = 32
     seconds: Annotated[int, Interval(1, 600)] = 400
     window: Annotated[int, Interval(1, 10_000)] = 50
@@ -133,7 +133,7 @@ class FilterPlan:
     likelihood: Annotated[float, Interval(0, 1)] = 0.03
     prediction: Annotated[float, Interval(0, 10)] = 0.3
     clip_norm: Annotated[float, Interval(0, 1e6, open_low=True)] = 1.0
-    checkpoint_every: Annotated[int, Interval(1, 1_000_000)] = 100
+    checkpoint_every: Annotated[int, Interval(1, 1_000_000)] = 64
     initial: str | None = None
     teacher: Annotated[float, Interval(0, 1)] = 0.0
 

@@ -13,6 +13,7 @@ from dptse_env.estimators.settings import (
     EnsembleSettings,
     EstimatorSettings,
     HorizonSettings,
+    MixtureSettings,
     RecurrentSettings,
     SigmaPointSettings,
     load_settings,
@@ -35,6 +36,7 @@ __all__ = [
     "EstimatorSettings",
     "HorizonSettings",
     "Measurement",
+    "MixtureSettings",
     "RecurrentSettings",
     "SigmaPointSettings",
     "check_estimate",
@@ -64,6 +66,7 @@ ESTIMATORS = Registry(
         "open_loop": "dptse_env.estimators.simple:OpenLoop",
         "recurrent": "dptse_env.estimators.recurrent:Recurrent",
         "asm": "dptse_env.estimators.asm:AdaptiveSmoothing",
+        "mixture": "dptse_env.estimators.mixture:Mixture",
     },
     check=_expected,
 )
@@ -142,7 +145,8 @@ def make_estimator(
     Args:
         estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `blend` (a mean
             of EKF and random walk), `open_loop` (no measurements), `recurrent` (a network), `asm`
-            (adaptive smoothing), a registered name, ``"package.module:Class"`` or a class.
+            (adaptive smoothing), `mixture` (of others), a registered name,
+            ``"package.module:Class"`` or a class.
         backend: `compiled` (numba), or `reference` (filterpy, qpsolvers, numpy), which EKF, UKF,
             EnKF and MHE have.
         model: The traffic model.

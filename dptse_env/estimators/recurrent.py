@@ -36,6 +36,9 @@ LARGEST_WIDTH = 512
 FORMAT = "recurrent-2"
 """Name of the channels' order and meaning; another one is refused."""
 
+SHIPPED = ("highway", "long-highway", "roads")
+"""Pairs that come with the package, each trained on more kinds of roads than those before it."""
+
 _FOLDER, _SUFFIX = Path(__file__).parent / "networks", ".safetensors"
 
 
@@ -61,7 +64,7 @@ class Recurrent(BatchEstimator):
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
         flows = model.reference_speed is not None
-        self.saved = read_network(member_for(settings.recurrent.weights, flows))
+        self.saved = network_for(settings.recurrent.weights, model.network, flows)
         self.cells = make_cells(model)
         S, n = model.n_segments, n_episodes
         self.hidden = np.zeros((n, S, self.saved.network.width), dtype=np.float32)
@@ -75,7 +78,8 @@ class Recurrent(BatchEstimator):
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
         """Refuse weights that are missing or cannot be read."""
-        read_network(member_for(settings.recurrent.weights, model.reference_speed is not None))
+        flows = model.reference_speed is not None
+        network_for(settings.recurrent.weights, model.network, flows)
 
     @staticmethod
     def inherits(
@@ -89,7 +93,7 @@ class Recurrent(BatchEstimator):
             largest_span: Largest number of segments of a query.
             settings: The settings.
         """
-        saved = read_network(member_for(settings.recurrent.weights, flows))
+        saved = network_for(settings.recurrent.weights, network, flows)
         is_outside = outside(saved, network, flows, largest_span)
         return ("estimator_settings.recurrent.weights",) if is_outside else ()
 
@@ -166,6 +170,24 @@ class SavedNetwork:
     network: Network
     card: Mapping[str, Any]
     source: str
+
+
+def network_for(weights: str | None, network: RoadNetwork, flows: bool) -> SavedNetwork:
+    """Return the network of a setting for a road: of `SHIPPED` the first that suits it, if None.
+
+    Args:
+        weights: The setting, see `RecurrentSettings`.
+        network: The road.
+        flows: Whether flows are released, not speeds.
+
+    Raises:
+        ValueError: See `read_network`.
+    """
+    if weights is not None:
+        return read_network(member_for(weights, flows))
+    members = (member_for(name, flows) for name in SHIPPED)
+    suited = [read_network(each) for each in members if each in shipped_networks()]
+    return next((each for each in suited if not outside(each, network, flows, 1)), suited[-1])
 
 
 def shipped_networks() -> list[str]:

@@ -139,11 +139,13 @@ class RecurrentSettings(_Checked, path=f"{_PATH}.recurrent"):
     Attributes:
         weights: Name of a network that ships with the package, or a file. A pair of networks, one
             for releases of flows and one for releases of speeds, goes by the name that they share:
-            ``highway`` stands for ``highway-flows`` or ``highway-speeds``. Outside of the ranges on
-            its card a network is used with a warning, and ``info["inherited"]`` names it.
+            ``roads`` stands for ``roads-flows`` or ``roads-speeds``. None takes ``highway`` or
+            ``long-highway`` on roads like those of the package, which they were trained on, and
+            ``roads`` on any other. Outside of the ranges on its card a network is used with a
+            warning, and ``info["inherited"]`` names it.
     """
 
-    weights: str = "highway"
+    weights: str | None = None
 
 
 @dataclass(frozen=True)
@@ -199,6 +201,29 @@ class AdaptiveSmoothingSettings(_Checked, path=f"{_PATH}.asm"):
 
 
 @dataclass(frozen=True)
+class MixtureSettings(_Checked, path=f"{_PATH}.mixture"):
+    """Settings of the mixture.
+
+    Attributes:
+        experts: Two or more names of estimators or of recurrent networks (`RecurrentSettings`).
+            They share all other settings.
+        memory: Seconds in which likelihoods are forgotten.
+    """
+
+    experts: tuple[str, ...] = ("highway", "roads")
+    memory: Annotated[float, Interval(2, 3600)] = 60.0
+
+    def __post_init__(self) -> None:
+        """Check values; lists become tuples."""
+        super().__post_init__()
+        if len(self.experts) < 2 or "mixture" in self.experts:
+            raise ValueError(
+                f"{_PATH}.mixture.experts must be two or more names of other estimators or of "
+                f"networks, got {shown(self.experts)}"
+            )
+
+
+@dataclass(frozen=True)
 class EstimatorSettings(_Checked, path=_PATH):
     """Tuning of the estimators, in units of the jam density rho_m and of v_f.
 
@@ -228,6 +253,7 @@ class EstimatorSettings(_Checked, path=_PATH):
         recurrent: Settings of the recurrent network; of the others it has `initial_variance`,
             `noise_scale` and `speed_cap`.
         asm: Settings of adaptive smoothing, which has the same ones of the others.
+        mixture: Settings of the mixture, whose experts share the others.
     """
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
@@ -245,6 +271,7 @@ class EstimatorSettings(_Checked, path=_PATH):
     blend: BlendSettings = field(default_factory=BlendSettings)
     recurrent: RecurrentSettings = field(default_factory=RecurrentSettings)
     asm: AdaptiveSmoothingSettings = field(default_factory=AdaptiveSmoothingSettings)
+    mixture: MixtureSettings = field(default_factory=MixtureSettings)
 
 
 def tuned_settings(

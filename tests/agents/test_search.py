@@ -33,7 +33,7 @@ SEARCH = Search(f"{SHORT} {json.dumps(KEYWORDS)}", "ekf", "0:2")
 
 
 def test_every_estimator_that_has_settings_can_be_tuned():
-    assert {*SPACE, "open_loop", "recurrent"} == set(ESTIMATORS)
+    assert {*SPACE, "open_loop", "recurrent", "mixture"} == set(ESTIMATORS)
 
 
 @pytest.mark.parametrize("estimator", SPACE)

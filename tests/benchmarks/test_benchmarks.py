@@ -54,7 +54,8 @@ def test_all_parts_run_and_write_one_table(tmp_path):
     path = tmp_path / "new" / "tables.md"
     printed = run("benchmarks", "--output", path)
     written = path.read_text(encoding="utf-8")
-    for name in ("EKF, filterpy", "MHE, qpsolvers", "libsumo alone", "PPO", "EKF, 21 segments"):
+    kinds = "EKF, filterpy", "MHE, qpsolvers", "libsumo alone", "road policy", "EKF, 21 segments"
+    for name in kinds:
         assert name in printed
         assert name in written
 

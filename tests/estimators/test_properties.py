@@ -107,7 +107,7 @@ def test_every_name_and_backend_follows_the_protocol(name, backend):
 
 def test_unknown_names_say_what_is_allowed():
     for name, backend, n, message in (
-        ("kf", "compiled", 1, r"estimator must be one of ekf, .*, asm, or .*, got 'kf'"),
+        ("kf", "compiled", 1, r"estimator must be one of ekf, .*, mixture, or .*, got 'kf'"),
         ("ekf", "torch", 1, "backend must be one of compiled, reference, got 'torch'"),
         ("ekf", "compiled", 0, "n_episodes must be >= 1, got 0"),
     ):
@@ -198,7 +198,10 @@ def test_the_seed_decides_and_the_global_generator_is_left_alone(name, backend, 
 # Soundness ----------------------------------------------------------------------------------------
 
 
-@over(("random_walk", "open_loop", "recurrent", "asm"), cases=[c for c in CASES if c[2] != "rows"])
+@over(
+    ("random_walk", "open_loop", "recurrent", "asm", "mixture"),
+    cases=[c for c in CASES if c[2] != "rows"],
+)
 def test_covariance_is_one_over_recorded_traffic(name, backend, release):
     """And no episode was put back to its prior, which would be a repair."""
     episodes = recorded(release)
@@ -235,7 +238,7 @@ def test_poor_starts_and_ten_times_the_noise_stay_finite_and_within_bounds(
             return
         assert (shown.density <= model.jam_density * (1.0 + 1e-12)).all()
         assert (shown.speed <= model.largest_speed * (1.0 + 1e-12)).all()
-        if name not in ("random_walk", "asm"):
+        if name not in ("random_walk", "asm", "mixture"):
             within = model.project(shown.states, bounds)
             np.testing.assert_allclose(within, shown.states, rtol=1e-9, atol=1e-9)
 

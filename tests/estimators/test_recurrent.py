@@ -8,6 +8,7 @@ import pytest
 from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent import (
     member_for,
+    network_for,
     outside,
     read_network,
     shipped_networks,
@@ -20,7 +21,7 @@ from dptse_env.estimators.recurrent_kernels import (
     LOWEST_SPREAD,
     make_cells,
 )
-from dptse_env.traffic import PAPER_HIGHWAY
+from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY
 from tests.hostile import check_hostile, edited
 
 from .helpers import card, network_settings, random_network, run, simulate, started, step
@@ -224,6 +225,8 @@ DIGESTS = {
     "highway-flows": ("a7cd6a7d0da0", "463df28b4d90"),
     "highway-speeds": ("98c08e7ad753", "2bb2c4ca118a"),
     "long-highway-flows": ("0718f2eebe91", "af13a07e0dc6"),
+    "roads-flows": ("", "c7615b36c533"),
+    "roads-speeds": ("", "91438623f310"),
 }
 """The first digits of the digests of the files before they were converted, and of their weights."""
 
@@ -250,7 +253,7 @@ def test_the_weights_that_ship_are_those_that_were_recorded():
         saved, content = read_network(name), hashlib.sha256()
         for array in saved.network:
             content.update(array.tobytes())
-        digests[name] = saved.card["converted_from"][:12], content.hexdigest()[:12]
+        digests[name] = saved.card.get("converted_from", "")[:12], content.hexdigest()[:12]
     assert digests == DIGESTS
 
 
@@ -265,6 +268,21 @@ def test_a_pair_is_found_by_the_name_it_shares(tmp_path):
     assert member_for("highway", flows=False) == "highway-speeds"
     with pytest.raises(ValueError, match=r"must be a file or one of highway, highway-flows, .*, g"):
         read_network("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("road", "flows", "network"),
+    [
+        (PAPER_HIGHWAY, True, "highway-flows"),
+        (PAPER_HIGHWAY, False, "highway-speeds"),
+        (CORRIDORS["long-highway"], True, "long-highway-flows"),
+        (CORRIDORS["long-highway"], False, "roads-speeds"),
+        (PAPER_HIGHWAY.replaced({"speed_limit": 100.0}), True, "roads-flows"),
+        (PAPER_HIGHWAY.replaced({"speed_limit": 30.0}), True, "roads-flows"),
+    ],
+)
+def test_the_network_of_the_package_that_knows_a_road_is_taken(road, flows, network):
+    assert network_for(None, road, flows).source == network
 
 
 def test_damaged_files_are_refused(path, tmp_path):

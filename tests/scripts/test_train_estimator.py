@@ -25,7 +25,8 @@ PLAN = {
 }
 SMALL = [
     "--env", SHORT, "--traffic", "0:2", "--validation-env", SHORT, "--validation", "1000:1001",
-    "--rounds", "ekf:1:2", "own:1:1", "--seeds", "0:2", "--workers", "1", "--plan",
+    "--initial", "None", "--rounds", "ekf:1:2", "own:1:1", "--seeds", "0:2", "--workers", "1",
+    "--plan",
     json.dumps(PLAN),
 ]  # fmt: skip
 

@@ -134,7 +134,7 @@ def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
     ("line", "message"),
     [
         ("bandwidth = 0", r"environment\.bandwidth must be an integer in 1"),
-        ('estimator = "best"', r"environment\.estimator must be one of .*, asm, got 'best'"),
+        ('estimator = "best"', r"environment\.estimator must be one of .*, mixture, got 'best'"),
         ("epsilon = 0", r"environment\.privacy\.epsilon must be"),
         ('incident = "some"', r"environment\.incident must be one of"),
         ('"a\\nb" = 0', r"environment\.a\\nb is unknown"),

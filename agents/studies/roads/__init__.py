@@ -1,8 +1,8 @@
 """Estimators on roads that nobody trained on: own roads, sections of longer ones, other simulators.
 
 Every vehicle answers queries, which go round robin. The filters have the parameters and settings
-that were calibrated for PrivateHighway-v1. Networks other than the one of the package are given by
-``--weights``; rows of the filters are played once.
+that were calibrated for PrivateHighway-v1. Networks other than those of the package are given by
+``--weights``; rows of the others are played once.
 
 dptse study roads --weights results/networks/seed-2/roads --output results/mine
 """
@@ -48,9 +48,7 @@ OPENED = False
 PRIVATE, PAPER = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/PaperHighway-v0"
 LONG = "dptse_env:dptse/LongHighway-v0"
 SEEDS, MORE_SEEDS = tuple(range(2000, 2008)), tuple(range(2000, 2016))
-FILTERS, NETWORK = ("ekf", "blend", "asm"), "recurrent"
-SHIPPED = "highway"
-"""The network of the package."""
+FILTERS, NETWORK, MIXTURE = ("ekf", "blend", "asm"), "recurrent", "mixture"
 PACED, CORRECTED = "paced", "corrected"
 RELEASES: dict[str, dict[str, Any]] = {
     PACED: {"privacy": PACED, "epsilon": 5.0},
@@ -59,6 +57,20 @@ RELEASES: dict[str, dict[str, Any]] = {
 }
 """Keywords of the release models, which are those of the environments that come with them."""
 
+
+class Learned(NamedTuple):
+    """An estimator with networks in it; those of the package if none is named."""
+
+    estimator: str
+    network: str = ""
+
+    def __str__(self) -> str:
+        """Return its name in tables."""
+        return f"`{self.estimator}` {self.network}".rstrip()
+
+
+SHIPPED = (Learned(NETWORK), Learned(MIXTURE))
+"""Those that come with the package."""
 
 _Part = tuple[dict[str, Any], tuple[int, ...]]
 
@@ -154,15 +166,18 @@ def road_cells(
     ]  # fmt: skip
 
 
-def study(weights: Sequence[str] = (SHIPPED,)) -> Study:
-    """Return the study with some networks, each a name or what the files of a pair begin with.
+def study(weights: Sequence[str] = ()) -> Study:
+    """Return the study, with some networks beside those of the package.
 
-    One of a pair is played where it suits.
+    Args:
+        weights: Networks, each a name or what the files of a pair begin with. One of a pair is
+            played where it suits.
 
     Raises:
         FileNotFoundError: There is no such network.
     """
-    who = [*((name, "", "") for name in FILTERS), *((NETWORK, w, named(w)) for w in weights)]
+    who = [*((name, "", "") for name in (*FILTERS, NETWORK, MIXTURE))]
+    who += [(NETWORK, each, named(each)) for each in weights]
     cells = [
         each
         for (road, release), (estimator, own, name) in product(lines(), who)
@@ -189,20 +204,20 @@ def best_filter(rows: pl.DataFrame, road: str, release: str) -> str:
     return min(FILTERS, key=lambda name: mean(rows, on_road(road, release, name), ERROR).mean)
 
 
-def gain(rows: pl.DataFrame, network: str, road: str, release: str) -> Interval:
-    """Return by how much a network's error lies below that of the best filter [%], paired.
+def gain(rows: pl.DataFrame, learned: Learned, road: str, release: str) -> Interval:
+    """Return by how much an error lies below that of the best filter [%], paired.
 
     Raises:
         UnmeasuredError: Something was not played there.
     """
     best = on_road(road, release, best_filter(rows, road, release))
-    return below(rows, on_road(road, release, NETWORK, network), best)
+    return below(rows, on_road(road, release, *learned), best)
 
 
-def networks_of(rows: pl.DataFrame) -> list[str]:
-    """Return the names of the networks that were played, that of the package first."""
-    names = rows.filter(estimator=NETWORK)["network"].unique().to_list()
-    return sorted(names, key=lambda name: (name != SHIPPED, name))
+def learned_in(rows: pl.DataFrame) -> list[Learned]:
+    """Return the estimators with networks that were played, those of the package first."""
+    own = rows.filter(pl.col("estimator") == NETWORK, pl.col("network") != "")
+    return [*SHIPPED, *(Learned(NETWORK, name) for name in own["network"].unique().sort())]
 
 
 def chi2(rows: pl.DataFrame, labels: Labels) -> list[float]:
@@ -210,11 +225,12 @@ def chi2(rows: pl.DataFrame, labels: Labels) -> list[float]:
     return [mean(rows, labels, f"chi2_{kind}").mean for kind in ("density", "speed")]
 
 
-def network_table(rows: pl.DataFrame, network: str) -> str:
-    """Return the table of a network beside the filters."""
+def table_of(rows: pl.DataFrame, learned: Learned) -> str:
+    """Return the table of an estimator with networks beside the filters."""
+    own = learned.estimator
 
     def of(estimator: str, line: tuple[str, str]) -> Labels:
-        return on_road(*line, estimator, network if estimator == NETWORK else "")
+        return on_road(*line, estimator, learned.network if estimator == own else "")
 
     def error(estimator: str, line: tuple[str, str]) -> str:
         return give_or_take(mean(rows, of(estimator, line), ERROR))
@@ -223,20 +239,20 @@ def network_table(rows: pl.DataFrame, network: str) -> str:
         return ", ".join(f"{each:.2f}" for each in chi2(rows, of(estimator, line)))
 
     def density_ratio(line: tuple[str, str]) -> str:
-        own, ekf = (mean(rows, of(each, line), DENSITY).mean for each in (NETWORK, "ekf"))
-        return f"{own / ekf:.2f}"
+        errors = [mean(rows, of(each, line), DENSITY).mean for each in (own, "ekf")]
+        return f"{errors[0] / errors[1]:.2f}"
 
     columns: dict[str, Callable[[tuple[str, str]], str]] = {
-        **{LABELS[name]: partial(error, name) for name in (*FILTERS, NETWORK)},
-        "below best filter [%]": lambda line: tenths(gain(rows, network, *line)),
-        **{f"χ² of {LABELS[name]}": partial(honesty, name) for name in (FILTERS[-1], NETWORK)},
+        **{LABELS[name]: partial(error, name) for name in (*FILTERS, own)},
+        "below best filter [%]": lambda line: tenths(gain(rows, learned, *line)),
+        **{f"χ² of {LABELS[name]}": partial(honesty, name) for name in (FILTERS[-1], own)},
         "density RMSE over EKF's": density_ratio,
     }
     heads = {f"{line[0]}{'*' * (line[0] in KEPT_BACK)}, {line[1]}": line for line in lines()}
     return grid("", list(heads), list(columns), lambda name, head: columns[head](heads[name]))
 
 
-def summary(rows: pl.DataFrame, network: str) -> str:
+def summary(rows: pl.DataFrame, learned: Learned) -> str:
     """Return a sentence for each release model on the own roads together.
 
     Raises:
@@ -247,10 +263,10 @@ def summary(rows: pl.DataFrame, network: str) -> str:
         gains, worst = {}, {}
         for road in OWN:
             with contextlib.suppress(UnmeasuredError):
-                gains[road] = gain(rows, network, road, release).mean
-                worst[road] = max(chi2(rows, on_road(road, release, NETWORK, network)))
+                gains[road] = gain(rows, learned, road, release).mean
+                worst[road] = max(chi2(rows, on_road(road, release, *learned)))
         if not gains:
-            raise UnmeasuredError(network)
+            raise UnmeasuredError(learned)
         least, largest = min(gains, key=gains.__getitem__), max(worst, key=worst.__getitem__)
         said.append(
             f"`{release}`: {np.mean([*gains.values()]):.1f} % below the best filter in the mean "
@@ -261,12 +277,12 @@ def summary(rows: pl.DataFrame, network: str) -> str:
 
 
 def draw_gains(rows: pl.DataFrame) -> Figure:
-    """Draw by how much the network of the package errs less than the best filter of each road."""
+    """Draw by how much the recurrent network errs less than the best filter of each road."""
     label = "error below that of the best filter [%]"
     names = list(dict.fromkeys(road for road, _ in lines()))
     series = {
         release: {
-            road: {label: gain(rows, SHIPPED, road, release)}
+            road: {label: gain(rows, Learned(NETWORK), road, release)}
             for road in names
             if release in ROADS[road].releases
         }
@@ -276,12 +292,12 @@ def draw_gains(rows: pl.DataFrame) -> Figure:
 
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
-    """Return a table for each network, and draw the gains of that of the package."""
+    """Return a table for each estimator with networks, and draw the gains of `recurrent`."""
     title = "Error of the recurrent network below that of the best filter, 95 % intervals"
     save_measured(folder / "fig_roads.png", title, draw_gains, rows)
     parts = ["# Roads that nobody trained on", NOTES, "![Gains](fig_roads.png)"]
-    for network in networks_of(rows):
-        parts += [f"## `{network}`", cell(summary, rows, network), network_table(rows, network)]
+    for each in learned_in(rows):
+        parts += [f"## {each}", cell(summary, rows, each), table_of(rows, each)]
     return "\n\n".join(parts)
 
 

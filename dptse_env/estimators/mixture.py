@@ -1,0 +1,158 @@
+"""A mixture of estimators, weighed by how well each foretells what is released."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.recurrent import Recurrent
+from dptse_env.estimators.settings import EstimatorSettings, RecurrentSettings
+from dptse_env.model import ARZModel
+from dptse_env.model.network import RoadNetwork
+from dptse_env.utils.arrays import FloatArray, IntArray
+
+LEAST_VARIANCE = 1e-12
+
+
+class Mixture(BatchEstimator):
+    """Experts on the same measurements, in a mixture that follows their likelihoods.
+
+    With the density (or average density, flow or speed) y of a row, its prediction m_i by expert i
+    and V_i the variance of that prediction, noise included, an expert's logarithmic likelihood
+    forgets in a memory of T steps:
+
+        L_i <- (1 - 1 / T) L_i - sum ((y - m_i)^2 / V_i + log V_i) / 2
+
+    over all numbers that are released. Its weight is in proportion to exp(L_i); means and variances
+    are those of the mixture. What is released is public, so that the weights are.
+
+    Where an expert diverges, all are reset to the prior, and the weights are equal again.
+
+    Attributes:
+        experts: The estimators.
+    """
+
+    is_compiled: ClassVar[bool] = True
+    has_demand: ClassVar[bool] = False
+    steps_model: ClassVar[bool] = False  # an expert may: see `check_settings`
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        self._fading = 1.0 - model.time_step / settings.mixture.memory
+        self.experts: list[BatchEstimator] = [
+            kind(model, n_episodes, own) for kind, own in _experts(settings)
+        ]
+        self._likelihoods = np.zeros((len(self.experts), n_episodes))
+        self._priors = np.zeros((n_episodes, 2 * model.n_segments))
+        self._streams: list[np.random.Generator | None] = [None] * n_episodes
+
+    @staticmethod
+    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
+        """Refuse settings that an expert cannot have on the road."""
+        from dptse_env.estimators import check_settings  # noqa: PLC0415 (which names this module)
+
+        for kind, own in _experts(settings):
+            check_settings(kind, model, own)
+
+    @staticmethod
+    def inherits(
+        network: RoadNetwork, flows: bool, largest_span: int, settings: EstimatorSettings
+    ) -> tuple[str, ...]:
+        """Return the setting of the experts where no network was trained on such roads."""
+        found = [
+            bool(kind.inherits(network, flows, largest_span, own))
+            for kind, own in _experts(settings)
+            if issubclass(kind, Recurrent)
+        ]
+        return ("estimator_settings.mixture.experts",) if found and all(found) else ()
+
+    @property
+    def weights(self) -> FloatArray:
+        """Weights of the experts, which add to 1, shape (number of experts, n)."""
+        weights: FloatArray = np.exp(self._likelihoods - self._likelihoods.max(axis=0))
+        weights /= weights.sum(axis=0)
+        return weights
+
+    @property
+    def means(self) -> FloatArray:
+        """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
+        estimate = self._estimate()
+        return np.stack([estimate.density, estimate.speed], axis=-1)
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        self._priors[episodes] = states
+        for episode, stream in zip(episodes.tolist(), generators, strict=True):
+            self._streams[episode] = stream
+        self._restart(episodes)
+
+    def _restart(self, episodes: IntArray) -> None:
+        streams = [self._streams[episode] for episode in episodes.tolist()]
+        for expert in self.experts:
+            expert.reset(episodes, self._priors[episodes], streams)
+        self._likelihoods[:, episodes] = 0.0
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        for expert in self.experts:
+            expert._predict(episodes, inputs)
+
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        observed = measured.observed[..., None]
+        errors, variances = self._foretold(self._estimate().at(episodes), measured)
+        self.innovations[episodes] = np.where(observed, errors / np.sqrt(variances), 0.0)
+        for expert, likelihood in zip(self.experts, self._likelihoods, strict=True):
+            errors, variances = self._foretold(expert._estimate().at(episodes), measured)
+            costs = np.where(observed, errors**2 / variances + np.log(variances), 0.0)
+            likelihood[episodes] *= self._fading
+            likelihood[episodes] -= 0.5 * costs.sum(axis=(1, 2))
+            expert._update(episodes, measured)
+        self.diverged[episodes] = np.any([each.diverged[episodes] for each in self.experts], axis=0)
+        self.fallback[episodes] = np.any([each.fallback[episodes] for each in self.experts], axis=0)
+        lost = episodes[self.diverged[episodes]]
+        if lost.size > 0:
+            self.innovations[lost] = 0.0
+            self._restart(lost)
+
+    def _foretold(self, estimate: Estimate, measured: Measurement) -> tuple[FloatArray, FloatArray]:
+        """Return errors (k, M, 2) of an estimate in what it foretells, and their variances."""
+        density, speed, density_std, speed_std = estimate
+        second, variance = speed, speed_std**2
+        if self.model.reference_speed is not None:
+            slip = speed - measured.centre
+            second = density * slip
+            variance = (density * speed_std) ** 2 + (slip * density_std) ** 2
+        # einsum, whose bits do not depend on the batch as those of a product of matrices do.
+        means = self.model.rows.averages(np.stack([density, second], axis=-1))
+        variances = np.einsum(
+            "ms,nsk->nmk", self.model.rows.weights**2, np.stack([density_std**2, variance], axis=-1)
+        )
+        return measured.values - means, np.maximum(variances + measured.sigma**2, LEAST_VARIANCE)
+
+    def _estimate(self) -> Estimate:
+        weights = self.weights[..., None]
+        table = np.array([expert._estimate() for expert in self.experts])
+        means = (weights[:, None] * table[:, :2]).sum(axis=0)
+        squares = table[:, 2:] ** 2 + (table[:, :2] - means) ** 2
+        return Estimate(*means, *np.sqrt((weights[:, None] * squares).sum(axis=0)))
+
+
+def _experts(settings: EstimatorSettings) -> list[tuple[type[BatchEstimator], EstimatorSettings]]:
+    """Return the classes and settings of the experts; a name that is no estimator's is a network's.
+
+    Raises:
+        ValueError: An estimator cannot be found.
+    """
+    from dptse_env.estimators import ESTIMATORS  # noqa: PLC0415 (which names this module)
+
+    found: list[tuple[type[BatchEstimator], EstimatorSettings]] = []
+    for name in settings.mixture.experts:
+        if name in ESTIMATORS or ":" in name:
+            found.append((ESTIMATORS.find(name), settings))
+        else:
+            own = dataclasses.replace(settings, recurrent=RecurrentSettings(name))
+            found.append((Recurrent, own))
+    return found
