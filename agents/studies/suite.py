@@ -29,7 +29,6 @@ from agents.play import Cell
 from agents.policies import find_policy, policy_name
 from agents.seeds import SUITE
 from agents.statistics import Interval
-from agents.studies.roads.own import OWN_ROADS
 from agents.study import ROWS, Study, read_table
 from agents.tables import (
     ERROR,
@@ -79,7 +78,15 @@ _SHORT_PACED: Mapping[str, Any] = {
 }
 _ELSEWHERE: Mapping[str, Any] = {
     "corridor": {
-        **OWN_ROADS["lane drop, 4 to 3"]["corridor"],
+        "lanes": (4,) * 9 + (3,) * 6,
+        "average_dwell": 6.8,
+        "demand": {
+            "base": {
+                "mainline": [[0.0, 2700.0], [200.0, 7400.0], [400.0, 2700.0]],
+                "on_ramps": [320.0, 300.0],
+            }
+        },
+        "incident": None,
         "drivers": {"model": "IDM", "headway": 1.4, "speed_deviation": 0.1},
     }
 }
