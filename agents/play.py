@@ -40,7 +40,7 @@ class Cell:
         keywords: Keywords of ``gym.make`` as plain JSON, without traffic seeds and records.
         labels: Columns that tell the cell apart in tables: strings and numbers.
         noise_seed: Noise is seeded with this plus the traffic seed.
-        deterministic: Whether the policy takes its likeliest action.
+        deterministic: Whether the policy takes its likeliest action; None for what its card says.
         transferred: Whether the policy may act in an environment that it was not trained for.
         watchers: Names in `agents.watchers.WATCHERS`, which add columns to the rows.
         seeds: Traffic seeds in place of the study's.
@@ -51,7 +51,7 @@ class Cell:
     keywords: Mapping[str, Any] = field(default_factory=dict)
     labels: Mapping[str, Any] = field(default_factory=dict)
     noise_seed: int = 0
-    deterministic: bool = True
+    deterministic: bool | None = None
     transferred: bool = False
     watchers: tuple[str, ...] = ()
     seeds: tuple[int, ...] | None = None
@@ -69,20 +69,21 @@ class Cell:
         """
         source = find_policy(self.policy)
         identity = source.identity
+        acts = source.deterministic if self.deterministic is None else self.deterministic
         content = {
             "env": self.env,
             "policy": identity if isinstance(source, NamedSchedule) else f"sha256:{identity}",
             "keywords": _with_digests(self.keywords),
             "noise_seed": self.noise_seed,
-            "deterministic": self.deterministic,
+            "deterministic": acts,
             "watchers": list(self.watchers),
         }
         return json.dumps(content, sort_keys=True)
 
     @property
     def all_keywords(self) -> dict[str, Any]:
-        """Keywords of ``gym.make``, those that the policy needs among them."""
-        return {**self.keywords, **find_policy(self.policy).keywords}
+        """Keywords of ``gym.make``; where they name no encoding of actions, that of the policy."""
+        return {**find_policy(self.policy).keywords, **self.keywords}
 
     def check(self) -> None:
         """Check keywords, policy and watchers without playing, recording or compiling.

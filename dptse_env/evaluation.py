@@ -28,7 +28,11 @@ Row = dict[str, Any]
 
 
 class Policy(Protocol):
-    """A query policy: a schedule, or a model of stable-baselines3."""
+    """A query policy: a schedule, or a model of stable-baselines3.
+
+    A policy that has an attribute ``deterministic`` says by it whether it is to take its likeliest
+    action; others are.
+    """
 
     def predict(
         self,
@@ -61,7 +65,7 @@ def evaluate(
     noise_seed: int = 0,
     *,
     warm_up: int = WARM_UP,
-    deterministic: bool = True,
+    deterministic: bool | None = None,
     watchers: Sequence[WatcherFactory] = (),
 ) -> list[Row]:
     """Play an episode on each traffic seed, and return a row for each.
@@ -78,7 +82,8 @@ def evaluate(
         seeds: Traffic seeds, one or more.
         noise_seed: Noise and estimator are seeded with this plus the traffic seed.
         warm_up: Seconds at the start of an episode that do not count [s].
-        deterministic: Whether the policy is asked for its likeliest action.
+        deterministic: Whether the policy is asked for its likeliest action; None for what it says
+            itself, a saved one by its card, and for the likeliest of one that says nothing.
         watchers: Make objects that add columns to the rows.
 
     Returns:
@@ -115,6 +120,8 @@ def evaluate(
     require(not unknown, "seeds", "among the environment's traffic_seeds", unknown)
     require(config.horizon_steps > warm_up, "warm_up", "shorter than an episode", warm_up)
     player = make_schedule(policy, bare)
+    if deterministic is None:
+        deterministic = getattr(player, "deterministic", True)
     rows: list[Row] = []
     for first in range(0, len(seeds), batch.size):
         wanted = list(seeds[first : first + batch.size])

@@ -19,6 +19,7 @@ GROUPS = {
         "train-estimator": "Train a recurrent network as an estimator.",
     },
     "bring your own": {
+        "policy": "Import a model of stable-baselines3 as a saved policy.",
         "import": "Import recorded trajectories, a SUMO network or a measured field as a road.",
         "record": "Record traffic with SUMO, so that environments only replay it.",
         "fit": "Fit parameters, estimator and query rule to a road.",

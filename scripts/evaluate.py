@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import polars as pl
 
@@ -31,6 +31,7 @@ from agents.study import run as run_study
 from agents.tables import DENSITY, ERROR, SPEED, difference, error_label, markdown, mean, values
 from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import parse_seeds
+from dptse_env.policies import DETERMINISTIC
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import require
@@ -51,10 +52,10 @@ class Args(Environment, Machines):
     schedules: tuple[str, ...] = tuple(OBSERVATION_SCHEDULES)
     """Schedules and oracles; 'all' has a bandwidth that covers the road."""
     policies: tuple[str, ...] = ()
-    """Saved policies by file or shipped name, "module:Class", or "module:Class=model.zip" of
-    stable-baselines3, which is unpickled: load those that you trust."""
-    stochastic: bool = False
-    """Let policies draw their actions, not take the likeliest."""
+    """Saved policies by file or shipped name, or "module:Class"; dptse policy import converts
+    models of stable-baselines3."""
+    acts: Literal["deterministic", "drawn"] | None = None
+    """Let policies take their likeliest actions or draw them; as their cards say if not given."""
     transfer: bool = False
     """Let policies act where they were not trained."""
     estimators: tuple[str, ...] = ()
@@ -121,7 +122,7 @@ def make_cells(args: Args) -> list[Cell]:
                     {**own, **more},
                     labels={"estimator": estimator, "policy": name},
                     noise_seed=args.noise_seed,
-                    deterministic=not args.stochastic,
+                    deterministic=None if args.acts is None else args.acts == DETERMINISTIC,
                     transferred=args.transfer,
                 )
             )

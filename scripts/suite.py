@@ -1,8 +1,8 @@
 """Score a query policy in the cells of the query suite, and write its card.
 
-dptse suite mine.safetensors
+dptse suite speed-front --cells short
 
-Scores stand beside the best rule's. What a folder has of an earlier run is not played again.
+Scores stand beside the best rule's, the mean only where all cells are played. What a folder has of an earlier run is not played again.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from agents.policies import policy_name
 from agents.studies import suite
 from agents.study import Study, play_study
 from agents.terminal import make_table, print_table
-from dptse_env.utils.fields import require
+from dptse_env.utils.fields import require, require_name
 from scripts.cli import Machines
 
 CARD = "card.json"
@@ -35,6 +35,8 @@ class Args(Machines):
     policies: tyro.conf.Positional[tuple[str, ...]]
     """Schedules; saved policies by file or shipped name; "module:Class". Where there are several,
     the first that suits a cell acts in it."""
+    cells: tuple[str, ...] = ()
+    """Cells by name; all of them if none is given."""
     beside: tuple[Path, ...] = ()
     """Cards of other policies, to be shown beside it."""
     output: Path | None = None
@@ -46,7 +48,9 @@ def main(args: Args) -> None:
     require(bool(args.policies), "policies", "one or more", args.policies)
     others = [suite.read_card(path) for path in args.beside]
     recorded = suite.recorded_rows()
-    cells = enter(args.policies)
+    for name in args.cells:
+        require_name("cells", name, list(suite.CELLS))
+    cells = enter(args.policies, args.cells or tuple(suite.CELLS))
     (entry,) = {each.labels["policy"] for each in cells}
     # A schedule by "module:Class" has a character that not every system allows in a path.
     folder = args.output or Path("results/my-suite") / entry.replace(":", "-")
@@ -63,8 +67,8 @@ def main(args: Args) -> None:
     print(f"the card is {folder / CARD}")
 
 
-def enter(policies: Sequence[str]) -> tuple[Cell, ...]:
-    """Return the cells with the first policy that suits each, and say which are left out, and why.
+def enter(policies: Sequence[str], names: Sequence[str]) -> tuple[Cell, ...]:
+    """Return cells with the first policy that suits each, and say which are left out, and why.
 
     Raises:
         FileNotFoundError: There is no such policy.
@@ -73,7 +77,7 @@ def enter(policies: Sequence[str]) -> tuple[Cell, ...]:
     entry = "+".join(map(policy_name, policies))
     reasons = dict.fromkeys(policies, "those before it act in all cells")
     found, left_out = {}, {}
-    for name in suite.CELLS:
+    for name in names:
         for source in policies:
             cell = suite.make_cell(name, entry, source)
             try:
@@ -87,10 +91,10 @@ def enter(policies: Sequence[str]) -> tuple[Cell, ...]:
     idle = [source for source in policies if source not in acting]
     if idle:
         raise ValueError(f"{idle[0]!r} acts in no cell: {reasons[idle[0]]}")
-    missing = [name for name in suite.CELLS if name not in found]
+    missing = [name for name in names if name not in found]
     if missing:
-        names = ", ".join(missing)
-        print(f"{entry} does not suit {names}: {left_out[missing[0]]}", file=sys.stderr)
+        which = ", ".join(missing)
+        print(f"{entry} does not suit {which}: {left_out[missing[0]]}", file=sys.stderr)
     return tuple(found.values())
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dptse_env.utils.arrays import AnyArray
+from dptse_env.utils.fields import require_name
 from dptse_env.utils.files import read_tensors
 from dptse_env.utils.registry import require_registered
 
@@ -16,10 +17,14 @@ SUFFIX = ".safetensors"
 TRANSFERABLE = ("corridor", "bandwidth")
 """Properties that a caller may allow to differ between a policy and its environment."""
 
+DETERMINISTIC, DRAWN = "deterministic", "drawn"
+"""How a policy acts, as its card says: by its likeliest action, or by a random one."""
+
 _FOLDER = Path(__file__).parent
 _FIELDS: Mapping[str, type] = {
     "fits": dict, "fits.action": str, "fits.corridor": str, "policy": dict, "policy.class": str,
-    "policy.arguments": dict, "env": str, "keywords": dict, "trained_on": str, "training": dict,
+    "policy.arguments": dict, "acts": str, "env": str,
+    "keywords": dict, "trained_on": str, "training": dict,
 }  # fmt: skip
 """Fields that a card must have, with their types."""
 
@@ -72,6 +77,11 @@ def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
             f"there is no saved policy {name!r}: neither a file, nor one of those that come with "
             f"the package ({known})"
         )
+    if path.suffix == ".zip":
+        raise ValueError(
+            f"{name} is no saved policy; dptse policy import makes one of a model of "
+            "stable-baselines3"
+        )
     card, weights = read_tensors(path)
     for field, kind in _FIELDS.items():
         value: Any = card
@@ -83,4 +93,5 @@ def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
                 f"{kind.__name__}"
             )
     require_registered(card["fits"]["action"], f"{name}: fits.action")
+    require_name(f"{name}: acts", card["acts"], (DETERMINISTIC, DRAWN))
     return PolicyFile(name, card, weights)

@@ -2,96 +2,323 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
-from dptse_env.policies import SUFFIX, TRANSFERABLE, read_policy
-from dptse_env.sb3.road_policy import RoadChannels, RoadPolicy, config_of
-from dptse_env.spaces.actions import ACTION_ENCODINGS
+from dptse_env.policies import DETERMINISTIC, DRAWN, SUFFIX, TRANSFERABLE, read_policy
+from dptse_env.sb3.road_policy import MOST_NEIGHBOURS, RoadChannels, RoadPolicy, config_of
+from dptse_env.spaces.actions import ACTION_ENCODINGS, MaskAction, PendingPicks
 from dptse_env.traffic import Corridor
-from dptse_env.utils.arrays import Action, BoolArray, Observation
-from dptse_env.utils.fields import integer
-from dptse_env.utils.files import write_tensors
+from dptse_env.utils.arrays import Action, AnyArray, BoolArray, FloatArray, Observation
+from dptse_env.utils.fields import integer, require_name
+from dptse_env.utils.files import require_arrays, write_tensors
 from dptse_env.utils.registry import needed_for, require_registered
 
-POLICY_FORMAT = "dptse-policy-1"
+POLICY_FORMAT = "dptse-policy-2"
 """Format of the weights; its number is raised when saved weights change their meaning."""
 
 MOST_LAYERS = 64
 """Largest number of layers of a perceptron."""
 
-SHARED, MASKED = "RoadPolicy", "MaskableActorCriticPolicy"
-CRITIC = "critic."
-"""Beginning of the names of a `RoadPolicy`'s weights that actions do not depend on."""
+ACTIVATIONS = ("Tanh", "ReLU", "ELU", "GELU", "LeakyReLU", "SiLU")
+"""Units of a perceptron, of `torch.nn`."""
 
-ACTOR_SIZES = ("width", "reach", "skips_sensors")
-"""Arguments of a `RoadPolicy` that its actor depends on."""
+SHARED = RoadPolicy.__name__
+"""The class whose network is shared by all segments."""
 
-CLASSES = (SHARED, "ActorCriticPolicy", MASKED)
-"""Classes of policies that can be saved. The network of the first is shared by all segments."""
+_PERCEPTRON = ("mlp_extractor.policy_net.", "action_net.", "log_std")
+_CRITIC = ("mlp_extractor.value_net.", "value_net.", "critic.", "lstm_critic.")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A class of policies that can be saved.
+
+    Attributes:
+        module: Where it is.
+        actions: Encodings of actions that it can have; none for all.
+        sizes: Its arguments beside the layers and the units of a perceptron.
+        actor: Beginnings of the names of weights that actions depend on, and that are saved.
+        rest: Beginnings of the names of those that only a training needs.
+    """
+
+    module: str
+    actions: tuple[str, ...] = ()
+    sizes: tuple[str, ...] = ()
+    actor: tuple[str, ...] = _PERCEPTRON
+    rest: tuple[str, ...] = _CRITIC
+
+
+KINDS: Mapping[str, Kind] = {
+    SHARED: Kind(
+        RoadPolicy.__module__, ("slots",), ("width", "reach", "skips_sensors"), ("scorer.",)
+    ),
+    "ActorCriticPolicy": Kind("stable_baselines3.common.policies"),
+    "MaskableActorCriticPolicy": Kind("sb3_contrib.common.maskable.policies", ("sequential",)),
+    "RecurrentActorCriticPolicy": Kind(
+        "sb3_contrib.common.recurrent.policies",
+        sizes=("lstm_hidden_size", "n_lstm_layers"),
+        actor=(*_PERCEPTRON, "lstm_actor."),
+    ),
+    "DQNPolicy": Kind(
+        "stable_baselines3.dqn.policies", ("sequential",), (), ("q_net.",), ("q_net_target.",)
+    ),
+    "QRDQNPolicy": Kind(
+        "sb3_contrib.qrdqn.policies", ("sequential",), ("n_quantiles",), ("quantile_net.",),
+        ("quantile_net_target.",),
+    ),
+}  # fmt: skip
+"""Classes of policies that can be saved, by name."""
 
 _PLAIN = "single segments"
 
 
-class ActingPolicy:
-    """A policy of stable-baselines3 that acts by observations alone.
+@dataclass(frozen=True, eq=False)
+class Normalisation:
+    """Statistics by which ``VecNormalize`` scales observations.
+
+    An observation x becomes (x - mean) / sqrt(variance + epsilon), clipped to -clip..clip.
 
     Attributes:
-        interface: Interface of its environment.
+        mean: Shape (size,).
+        variance: Shape (size,).
+        clip: Largest scaled value.
+        epsilon: Added to variances.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    clip: FloatArray
+    epsilon: FloatArray
+
+    @classmethod
+    def of(cls, scaled: VecNormalize | None) -> Normalisation | None:
+        """Return the present statistics; None where observations are not scaled."""
+        if scaled is None or not scaled.norm_obs:
+            return None
+        mean, variance = (np.array(each, dtype=np.float64) for each in _moments(scaled))
+        return cls(mean, variance, np.array(float(scaled.clip_obs)), np.array(scaled.epsilon))
+
+    @classmethod
+    def taken_from(cls, arrays: dict[str, AnyArray], size: int) -> Normalisation | None:
+        """Take the statistics out of the arrays of a file; None where it has none.
+
+        Raises:
+            ValueError: They are incomplete, of another shape or type, or out of range.
+        """
+        own = {key: arrays.pop(key) for key in list(arrays) if key.startswith(_NORMALISATION)}
+        if not own:
+            return None
+        shapes = {f"{_NORMALISATION}{field.name}": () for field in dataclasses.fields(cls)}
+        vectors = dict.fromkeys([f"{_NORMALISATION}{x}" for x in ("mean", "variance")], (size,))
+        require_arrays(own, {**shapes, **vectors}, np.float64)
+        found = cls(**{key.removeprefix(_NORMALISATION): own[key] for key in own})
+        if (found.variance < 0).any() or found.clip <= 0 or found.epsilon <= 0:
+            raise ValueError("normalisation must have variances >= 0, clip and epsilon above 0")
+        return found
+
+    def arrays(self) -> dict[str, AnyArray]:
+        """Return the statistics as arrays of a file."""
+        return {f"{_NORMALISATION}{key}": each for key, each in vars(self).items()}
+
+    def __call__(self, observation: Observation) -> Observation:
+        """Return scaled observations."""
+        scaled = (observation - self.mean) / np.sqrt(self.variance + self.epsilon)
+        clipped: Observation = np.clip(scaled, -self.clip, self.clip).astype(np.float32)
+        return clipped
+
+
+_NORMALISATION = "normalisation."
+
+
+def _moments(scaled: VecNormalize) -> tuple[Any, Any]:
+    statistics: Any = scaled.obs_rms
+    return statistics.mean, statistics.var
+
+
+class Memory(NamedTuple):
+    """What a policy remembers that acts in another encoding than its own.
+
+    Attributes:
+        state: Of the policy itself.
+        pending: Of its own encoding.
+        wanted: The options of the decision in progress, shape (k, n_options).
+    """
+
+    state: Any
+    pending: PendingPicks
+    wanted: BoolArray
+
+
+class ActingPolicy:
+    """A policy of stable-baselines3 that acts in an environment of this package.
+
+    Where the environment has another encoding of actions than the policy, the options that the
+    policy wants are found by its own encoding, and asked for by that of the environment.
+
+    Attributes:
+        policy: The policy of stable-baselines3.
+        interface: Interface of the environment.
         card: Description of the policy, its training, and the environments it fits; empty where it
             was not loaded.
+        deterministic: Whether it takes its likeliest action unless told otherwise.
     """
 
     def __init__(
-        self, policy: BasePolicy, interface: QueryInterface, card: Mapping[str, Any] | None = None
+        self,
+        policy: BasePolicy,
+        interface: QueryInterface,
+        card: Mapping[str, Any] | None = None,
+        normalisation: VecNormalize | Normalisation | None = None,
+        own: QueryInterface | None = None,
     ) -> None:
-        """Bind a policy to an environment's interface."""
-        self._policy, self.interface, self.card = policy, interface, dict(card or {})
+        """Bind a policy to an environment's interface.
+
+        Args:
+            policy: The policy.
+            interface: Interface of the environment.
+            card: Its card, if it has one.
+            normalisation: Of its observations; the statistics of a ``VecNormalize`` are those of
+                this moment.
+            own: Interface of the environments that it was trained in, if that is another.
+
+        Raises:
+            ValueError: Its actions cannot be said in the encoding of the environment.
+        """
+        if isinstance(normalisation, VecNormalize):
+            normalisation = Normalisation.of(normalisation)
+        self.policy, self.interface, self.card = policy, interface, dict(card or {})
+        self.deterministic = self.card.get("acts", DETERMINISTIC) == DETERMINISTIC
+        self._normalisation, self._own = normalisation, own or interface
+        self._is_at_home = type(self._own.actions) is type(interface.actions)
+        if not self._is_at_home:
+            _check_translation(self._own, interface)
         # A maskable policy expects masks as an argument; they are part of the observation.
-        self._takes_masks = type(policy).__name__ == MASKED
+        self._takes_masks = type(policy).__name__ == "MaskableActorCriticPolicy"
 
     def predict(
         self,
         observation: Observation,
-        state: tuple[Any, ...] | None = None,
+        state: Any = None,
         episode_start: Any = None,
-        deterministic: bool = False,
-    ) -> tuple[Action, tuple[Any, ...] | None]:
-        """Return actions for one observation (size,) or a batch (k, size).
+        deterministic: bool | None = None,
+    ) -> tuple[Action, Any]:
+        """Return actions for one observation (size,) or a batch (k, size), and the new state.
 
         Args:
             observation: From the environment.
-            state: Not needed; returned as it is.
-            episode_start: Not needed.
-            deterministic: The most probable action instead of a random one. Random ones are drawn
-                by torch's generator.
+            state: The state returned by the last call, None at the first.
+            episode_start: Flags of episodes that have just begun, shape (k,) or a single flag.
+            deterministic: Whether to take the likeliest action instead of a random one, drawn by
+                torch's generator; None for what the card says.
         """
+        if deterministic is None:
+            deterministic = self.deterministic
+        if episode_start is not None:
+            shape = np.shape(observation)[:-1] or (1,)
+            episode_start = np.broadcast_to(episode_start, shape).astype(bool)
+        if self._is_at_home:
+            return self._act(np.asarray(observation), state, episode_start, deterministic)
+        batch = np.atleast_2d(observation)
+        action, state = self._translated(batch, state, episode_start, deterministic)
+        return (action[0] if np.ndim(observation) == 1 else action), state
+
+    def _act(
+        self, observation: Observation, state: Any, start: BoolArray | None, deterministic: bool
+    ) -> tuple[Action, Any]:
+        """Return actions in the policy's own encoding for observations as it was trained on."""
         extra: dict[str, Any] = {}
         if self._takes_masks:
-            extra["action_masks"] = self._masks(np.asarray(observation))
-        action, _ = self._policy.predict(observation, deterministic=deterministic, **extra)
-        return action, state
+            extra["action_masks"] = self._masks(observation)
+        if self._normalisation is not None:
+            observation = self._normalisation(observation)
+        return self.policy.predict(observation, state, start, deterministic, **extra)
 
     def _masks(self, observation: Observation) -> BoolArray:
         """Return the options that may be picked next, (G,) or (k, G)."""
-        actions = self.interface.actions
-        picked = np.zeros((*observation.shape[:-1], actions.n_options), dtype=bool)
-        if actions.actions_per_step > 1:
-            picked = self.interface.observations.block(observation, "picked") > 0
-        return actions.available(np.atleast_2d(picked)).reshape(picked.shape)
+        actions = self._own.actions
+        picked = np.atleast_2d(_picked(self._own, observation))
+        return actions.available(picked).reshape(*observation.shape[:-1], actions.n_options)
+
+    def _translated(
+        self, batch: Observation, memory: Memory | None, start: BoolArray | None, likeliest: bool
+    ) -> tuple[Action, Memory]:
+        """Return actions (k, ...) in the encoding of the environment."""
+        k, n = len(batch), self._own.actions.n_options
+        if memory is None:
+            memory = Memory(None, PendingPicks(k, n), np.zeros((k, n), dtype=bool))
+        elif start is not None:
+            memory.pending.reset(np.flatnonzero(start))
+        picked = _picked(self.interface, batch)
+        fresh = ~picked.any(axis=1, keepdims=True)
+        if fresh.any():  # the last pick was of an earlier second
+            decided = self._decide(batch, memory, start, likeliest)
+            wanted = np.where(fresh, decided.wanted, memory.wanted)
+            memory = decided._replace(wanted=wanted)
+        return self.interface.actions.encode(memory.wanted, picked), memory
+
+    def _decide(
+        self, batch: Observation, memory: Memory, start: BoolArray | None, likeliest: bool
+    ) -> Memory:
+        """Let the policy choose options in its own encoding, by one action or one after another."""
+        every, (state, pending, _) = np.arange(len(batch)), memory
+        wanted, complete = pending.picked, np.zeros(len(batch), dtype=bool)
+        while not complete.all():
+            seen = self._as_trained(batch, wanted)
+            action, state = self._act(seen, state, start, likeliest)
+            wanted, _, complete = self._own.actions.decode(every, action, pending)
+            start = None if start is None else np.zeros_like(start)
+        return Memory(state, pending, wanted)
+
+    def _as_trained(self, batch: Observation, picked: BoolArray) -> Observation:
+        """Return observations (k, size) as the environments of the training gave them."""
+        here = self.interface.observations
+        blocks = [
+            here.block(batch, name) if name in here.slices else picked.astype(np.float32)
+            for name in self._own.observations.slices
+        ]
+        return np.concatenate(blocks, axis=1)
+
+
+def _picked(interface: QueryInterface, observation: Observation) -> BoolArray:
+    """Return the options picked so far for the next query, (n_options,) or (k, n_options)."""
+    if "picked" not in interface.observations.slices:
+        return np.zeros((*observation.shape[:-1], interface.actions.n_options), dtype=bool)
+    picked: BoolArray = interface.observations.block(observation, "picked") > 0
+    return picked
+
+
+def _check_translation(own: QueryInterface, other: QueryInterface) -> None:
+    """Refuse encodings between which sets of options cannot be translated."""
+    there, here = (type(each.actions).__name__ for each in (own, other))
+    if isinstance(own.actions, MaskAction):
+        raise ValueError(
+            f"its actions ({there}) may query less than the bandwidth pays for, which those of the "
+            f"environment ({here}) cannot: make the environment with action='mask'"
+        )
+    one_by_one = own.actions.picks_one_by_one or other.actions.picks_one_by_one
+    if one_by_one and own.queries.costs_differ:
+        raise ValueError(
+            f"actions cannot be translated from {there} to {here} where queries cost different "
+            "amounts and one encoding picks one by one: make the environment with its own encoding"
+        )
 
 
 def save_policy(
@@ -103,19 +330,25 @@ def save_policy(
     keywords: Mapping[str, Any],
     training: Mapping[str, Any],
     figures: Mapping[str, Any],
+    normalisation: VecNormalize | None = None,
+    deterministic: bool = True,
 ) -> None:
-    """Write a policy's weights and its card to a file.
+    """Write the weights that a policy acts by, and its card, to a file.
 
-    An existing file is replaced when the new one is complete.
+    An existing file is replaced when the new one is complete. Critics and target networks, which
+    only a training needs, are left out.
 
     Args:
         path: A file that ends in ``.safetensors``.
-        policy: One of `RoadPolicy`, ``ActorCriticPolicy``, ``MaskableActorCriticPolicy``.
+        policy: Of one of the classes of `KINDS`, with the features of flat observations.
         config: Configuration of the environment that it was trained on.
         env: Id of that environment.
         keywords: Keywords of that environment, plain JSON.
         training: Recipe, seeds, steps; plain JSON.
         figures: Results, by name; plain JSON.
+        normalisation: What scaled its observations in the training. Its statistics travel in the
+            file, and are applied wherever the policy acts.
+        deterministic: Whether it is to take its likeliest action, or to draw actions.
 
     Raises:
         ValueError: The policy could not be loaded again: it is of another class, has additional
@@ -124,29 +357,34 @@ def save_policy(
         OSError: The file cannot be written.
     """
     name = type(policy).__name__
-    if name not in CLASSES:
-        raise ValueError(f"policy must be one of {', '.join(CLASSES)}, got {name}")
+    kind = KINDS.get(name)
+    if kind is None or type(policy).__module__ != kind.module:
+        raise ValueError(
+            f"policy must be one of {', '.join(KINDS)}, got {type(policy).__module__}.{name}"
+        )
     if Path(path).suffix != SUFFIX:
         raise ValueError(f"path must end in {SUFFIX}, got {os.fspath(path)!r}")
-    card: dict[str, Any] = {
-        "fits": _fit(config, name),
-        "policy": {"class": name, "arguments": _arguments(policy)},
-        "env": env,
-        "keywords": dict(keywords),
-        "trained_on": describe_road(config.corridor),
-        "estimator": ESTIMATORS.name_of(config.estimator),
-        "epsilon": config.privacy.epsilon,
-        "versions": {name: version(name) for name in ("dptse-env", "stable-baselines3", "torch")},
-        "training": dict(training),
-        "figures": dict(figures),
-    }
-    weights = {
-        key: value.detach().cpu().numpy()
-        for key, value in policy.state_dict().items()
-        if name != SHARED or not key.startswith(CRITIC)
-    }
+    statistics = Normalisation.of(normalisation)
     try:
+        card: dict[str, Any] = {
+            "fits": _fit(config, name),
+            "policy": {"class": name, "arguments": _arguments(policy, kind)},
+            "acts": DETERMINISTIC if deterministic else DRAWN,
+            "env": env,
+            "keywords": dict(keywords),
+            "trained_on": describe_road(config.corridor),
+            "estimator": ESTIMATORS.name_of(config.estimator),
+            "epsilon": config.privacy.epsilon,
+            "versions": {
+                name: version(name) for name in ("dptse-env", "stable-baselines3", "torch")
+            },
+            "training": dict(training),
+            "figures": dict(figures),
+        }
+        weights = _actor(policy, kind)
         require_registered(card["fits"]["action"], "fits.action")
+        if statistics is not None:
+            weights |= statistics.arrays()
         _made(card, weights, config)
     except ValueError as problem:
         raise ValueError(f"policy cannot be saved: {problem}") from problem
@@ -165,7 +403,9 @@ def load_policy(
         source: A file, or the name of a policy that comes with the package
             (`dptse_env.policies`).
         env: The environment in which it acts: of this package, scalar or vector, wrapped or not,
-            or as an `SB3VecEnv`.
+            or as an `SB3VecEnv`. Its actions may be in another encoding than those of the
+            policy, which are translated then; only actions of ``mask``, which may query less than
+            the bandwidth pays for, fit no other encoding.
         allow: Properties that may differ on purpose, of `TRANSFERABLE`. Estimator, privacy and
             traffic model may always differ. With ``"corridor"`` a `RoadPolicy` acts on
             roads of any size whose observations have the same channels (`RoadChannels`); a
@@ -182,11 +422,13 @@ def load_policy(
     config = config_of(env)
     file = read_policy(source)
     try:
-        _check_fit(file.card, config, allow)
-        policy = _made(file.card, file.weights, config)
+        own = dataclasses.replace(config, action=file.card["fits"]["action"])
+        _check_fit(file.card, own, allow)
+        policy, normalisation = _made(file.card, dict(file.weights), own)
+        interface = make_interface(config)
+        return ActingPolicy(policy, interface, file.card, normalisation, make_interface(own))
     except ValueError as problem:
         raise ValueError(f"policy {file.source!r} cannot be loaded: {problem!s:.1000}") from problem
-    return ActingPolicy(policy, make_interface(config), file.card)
 
 
 def describe_road(corridor: Corridor) -> str:
@@ -226,7 +468,7 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
         ValueError: A property outside `allow` differs; the message names the values of both.
     """
     there, here = card["fits"], _fit(config, card["policy"]["class"])
-    pairs = {key: (there.get(key), here[key]) for key in ("format", "action", "bandwidth")}
+    pairs = {key: (there.get(key), here[key]) for key in ("format", "bandwidth")}
     pairs["queries"] = there.get("queries", _PLAIN), here.get("queries", _PLAIN)
     road_there, road_here = there["corridor"], here["corridor"]
     observations = there.get("observation"), here["observation"]
@@ -259,56 +501,92 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
 # The network of a policy, described by the arguments on its card.
 
 
-def _arguments(policy: BasePolicy) -> dict[str, Any]:
-    """Return the arguments from which `_made` makes such a policy, as plain JSON."""
+def _arguments(policy: Any, kind: Kind) -> dict[str, Any]:
+    """Return the arguments from which `_made` makes such a policy, as plain JSON.
+
+    Raises:
+        ValueError: It has parts that arguments do not describe.
+    """
     if isinstance(policy, RoadPolicy):
-        return {name: policy.sizes[name] for name in ACTOR_SIZES}
-    # Maskable policies have the same attributes, without being of the same class.
-    perceptron: Any = policy
-    if perceptron.activation_fn is not nn.Tanh:
-        units = perceptron.activation_fn.__name__
-        raise ValueError(f"policy must have Tanh units, got {units}")
-    return {"net_arch": perceptron.net_arch}
+        return {name: policy.sizes[name] for name in kind.sizes}
+    if policy.features_extractor_class is not FlattenExtractor:
+        name = policy.features_extractor_class.__name__
+        raise ValueError(f"policy must have the features of FlattenExtractor, got {name}")
+    if getattr(policy, "use_sde", False):
+        raise ValueError("policy must have use_sde=False")
+    architecture, units = policy.net_arch, policy.activation_fn.__name__
+    require_name("policy.activation_fn", units, ACTIVATIONS)
+    sizes = {
+        "lstm_hidden_size": lambda: policy.lstm_output_dim,
+        "n_lstm_layers": lambda: policy.lstm_hidden_state_shape[0],
+        "n_quantiles": lambda: policy.n_quantiles,
+    }
+    return {
+        "layers": architecture["pi"] if isinstance(architecture, dict) else architecture,
+        "units": units,
+        **{name: sizes[name]() for name in kind.sizes},
+    }
+
+
+def _actor(policy: BasePolicy, kind: Kind) -> dict[str, AnyArray]:
+    """Return the weights that actions depend on.
+
+    Raises:
+        ValueError: There are weights of parts that are unknown.
+    """
+    weights = policy.state_dict()
+    unknown = [key for key in weights if not key.startswith((*kind.actor, *kind.rest))]
+    if unknown:
+        raise ValueError(f"policy has weights of unknown parts: {', '.join(unknown)!s:.200}")
+    return {
+        key: value.detach().cpu().numpy()
+        for key, value in weights.items()
+        if key.startswith(kind.actor)
+    }
 
 
 def _made(
-    card: Mapping[str, Any], weights: Mapping[str, np.ndarray[Any, Any]], config: EnvConfig
-) -> BasePolicy:
-    """Make the policy of a card for an environment of ``config``.
+    card: Mapping[str, Any], arrays: Mapping[str, AnyArray], config: EnvConfig
+) -> tuple[BasePolicy, Normalisation | None]:
+    """Make the policy of a card for an environment of ``config``, with its normalisation.
 
     Raises:
         ValueError: An argument is unknown or out of range, or the weights are others.
     """
     name, arguments = card["policy"]["class"], card["policy"]["arguments"]
-    if name not in CLASSES:
-        raise ValueError(f"policy.class must be one of {', '.join(CLASSES)}, got {name!r:.80}")
-    if any(array.dtype != np.float32 for array in weights.values()):
-        raise ValueError("weights must be of float32 alone")
+    if name not in KINDS:
+        raise ValueError(f"policy.class must be one of {', '.join(KINDS)}, got {name!r:.80}")
+    kind, interface, weights = KINDS[name], make_interface(config), dict(arrays)
+    action = ACTION_ENCODINGS.name_of(config.action)
+    if kind.actions and action not in kind.actions:
+        raise ValueError(f"{name} acts by action encoding {kind.actions[0]!r}, got {action!r}")
+    (size,) = interface.observations.space.shape
+    normalisation = Normalisation.taken_from(weights, size)
+    if normalisation is not None and name == SHARED:
+        raise ValueError(f"{name} scales observations itself: train it with norm_obs=False")
     n_values = sum(array.size for array in weights.values())
     # The random initial weights are replaced; torch's generator is left unchanged.
     with torch.random.fork_rng(devices=[]):
         if name == SHARED:
-            _check_shared(arguments, n_values)
+            _check_shared(arguments, kind, n_values)
             policy: BasePolicy = RoadPolicy.from_config(config, **arguments)
         else:
-            policy = _perceptron(name, arguments, config, n_values)
-    tensors = {key: torch.tensor(array) for key, array in weights.items()}
-    if name == SHARED:
-        own = policy.state_dict()
-        tensors |= {key: own[key] for key in own if key.startswith(CRITIC)}
-    try:
-        policy.load_state_dict(tensors)
-    except RuntimeError as problem:  # the message has a line for each of them
-        raise ValueError(" ".join(str(problem).split())) from problem
-    policy.set_training_mode(False)
-    return policy
-
-
-def _check_shared(arguments: Mapping[str, Any], n_values: int) -> None:
-    _check_names(arguments, set(ACTOR_SIZES))
-    width, reach = (
-        integer(f"policy.arguments.{name}", arguments[name], 1) for name in ("width", "reach")
+            policy = _perceptron(name, arguments, interface, n_values)
+    require_arrays(
+        weights,
+        {key: value.shape for key, value in _actor(policy, kind).items()},
+        np.float32,
     )
+    tensors = {key: torch.tensor(array) for key, array in weights.items()}
+    policy.load_state_dict(tensors, strict=False)  # a critic keeps its random weights
+    policy.set_training_mode(False)
+    return policy, normalisation
+
+
+def _check_shared(arguments: Mapping[str, Any], kind: Kind, n_values: int) -> None:
+    _check_names(arguments, kind.sizes)
+    width = integer("policy.arguments.width", arguments["width"], 1)
+    reach = integer("policy.arguments.reach", arguments["reach"], 1, MOST_NEIGHBOURS)
     # Of the trunk's second convolution and of its mean.
     _check_size(2 * (reach + 1) * width * width, n_values)
     if not isinstance(skips := arguments["skips_sensors"], bool):
@@ -316,39 +594,46 @@ def _check_shared(arguments: Mapping[str, Any], n_values: int) -> None:
 
 
 def _perceptron(
-    name: str, arguments: Mapping[str, Any], config: EnvConfig, n_values: int
+    name: str, arguments: Mapping[str, Any], interface: QueryInterface, n_values: int
 ) -> BasePolicy:
-    _check_names(arguments, {"net_arch"})
-    architecture, interface = arguments["net_arch"], make_interface(config)
-    branches = architecture if isinstance(architecture, dict) else {"pi": architecture}
-    for branch, widths in branches.items():
-        if branch not in ("pi", "vf") or not isinstance(widths, list):
-            raise ValueError(
-                "policy.arguments.net_arch must be a list of widths, or one each for pi and vf, "
-                f"got {architecture!r:.80}"
-            )
-        integer("policy.arguments.net_arch: layers", len(widths), 0, MOST_LAYERS)
-        units = [integer(f"policy.arguments.net_arch[{k}]", w, 1) for k, w in enumerate(widths)]
-        inputs = spaces.flatdim(interface.observations.space)
-        _check_size(sum(a * b for a, b in pairwise([inputs, *units])), n_values)
-    kind: Any = ActorCriticPolicy
-    if name == MASKED:
-        if config.action != "sequential":
-            raise ValueError(f"{name} acts by action encoding 'sequential', got {config.action!r}")
-        with needed_for("a policy with masks"):  # no other one needs sb3-contrib
-            from sb3_contrib.common.maskable import policies  # noqa: PLC0415
-
-        kind = policies.MaskableActorCriticPolicy
-    # The weights are replaced, so the slow orthogonal initialisation is not needed.
-    policy: BasePolicy = kind(
-        interface.observations.space, interface.actions.space, lambda _: 0.0, ortho_init=False,
-        **arguments,
-    )  # fmt: skip
+    kind, n_actions = KINDS[name], interface.actions.n_options
+    _check_names(arguments, ("layers", "units", *kind.sizes))
+    layers, units = arguments["layers"], arguments["units"]
+    if not isinstance(layers, list):
+        raise ValueError(f"policy.arguments.layers must be a list of widths, got {layers!r:.80}")
+    integer("policy.arguments.layers: their number", len(layers), 0, MOST_LAYERS)
+    widths = [integer(f"policy.arguments.layers[{k}]", w, 1) for k, w in enumerate(layers)]
+    sizes = {size: integer(f"policy.arguments.{size}", arguments[size], 1) for size in kind.sizes}
+    require_name("policy.arguments.units", units, ACTIVATIONS)
+    (inputs,), wanted = interface.observations.space.shape, 0
+    if hidden := sizes.get("lstm_hidden_size", 0):
+        depth = integer("policy.arguments.n_lstm_layers", sizes["n_lstm_layers"], 1, MOST_LAYERS)
+        wanted += 4 * hidden * (inputs + hidden + 2 * (depth - 1) * hidden)
+        inputs = hidden
+    widths = [inputs, *widths]
+    wanted += sum(a * b for a, b in pairwise(widths))
+    _check_size(wanted + widths[-1] * n_actions * sizes.get("n_quantiles", 0), n_values)
+    with needed_for(f"a {name}"):  # most classes are of sb3-contrib
+        make: Any = getattr(importlib.import_module(kind.module), name)
+    net_arch: Any = layers
+    if issubclass(make, ActorCriticPolicy) or "Maskable" in name:
+        # The weights are replaced, so the slow orthogonal initialisation is not needed.
+        net_arch, sizes["ortho_init"] = {"pi": layers, "vf": []}, False
+    if "lstm_hidden_size" in sizes:
+        sizes |= {"shared_lstm": True, "enable_critic_lstm": False}
+    policy: BasePolicy = make(
+        interface.observations.space,
+        interface.actions.space,
+        BasePolicy._dummy_schedule,
+        net_arch=net_arch,
+        activation_fn=getattr(nn, units),
+        **sizes,
+    )
     return policy
 
 
-def _check_names(arguments: Mapping[str, Any], expected: set[str]) -> None:
-    if set(arguments) != expected:
+def _check_names(arguments: Mapping[str, Any], expected: Sequence[str]) -> None:
+    if set(arguments) != set(expected):
         raise ValueError(
             f"policy.arguments must be {', '.join(sorted(expected))}, got "
             f"{', '.join(map(repr, arguments))!s:.80}"

@@ -17,7 +17,7 @@ from stable_baselines3 import PPO
 from dptse_env.config import PRESETS, resolve
 from dptse_env.parts import make_interface
 from dptse_env.sb3 import PlackettLuce, RoadChannels, RoadPolicy, SB3VecEnv
-from dptse_env.sb3.road_policy import RoadFeatures, make_windows
+from dptse_env.sb3.road_policy import RoadFeatures, Windows
 from tests.helpers import SHORT, PricedRelease, SumRelease
 
 # The distribution.
@@ -124,7 +124,7 @@ def raw(road, name, observation):
     """The values of a channel before it is scaled; None where there are none."""
     (k,) = (k for k, channel in enumerate(road.channels) if channel.name == name)
     channel = road.channels[k]
-    shown = RoadFeatures(road)(observation)[0, :, k].numpy() * channel.scale + channel.centre
+    shown = RoadFeatures(road, 1)(observation)[:, k, 0].numpy() * channel.scale + channel.centre
     return [x if at is not None else None for x, at in zip(shown, channel.source, strict=True)]
 
 
@@ -137,8 +137,8 @@ def test_mainline_blocks_stand_at_their_segments():
         for name in ("density", "speed_log_std", "released_density", released, "age", "queried"):
             found = raw(road, f"mainline {name}", observation)
             np.testing.assert_allclose(found, starts[name] + np.arange(n), rtol=1e-5)
-        features = RoadFeatures(road)
-        assert features(observation).shape == (1, n, features.n_channels)
+        features = RoadFeatures(road, 2)
+        assert features(observation).shape == (n, features.n_inputs, 1)
 
 
 def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
@@ -216,12 +216,43 @@ def test_a_segment_with_a_fixed_sensor_is_queried_when_there_is_no_other():
         assert (every[:, -1] == 14).all()
 
 
+def test_neighbours_come_with_a_segment_and_its_place():
+    road = make_policy().road
+    observation = torch.rand(1, road.size)
+    inputs = RoadFeatures(road, 2)(observation)[..., 0]
+    own = inputs[:, : (inputs.shape[1] - 3) // 5]
+    upstream, downstream = (
+        inputs[:, own.shape[1] : 2 * own.shape[1]],
+        inputs[:, -3 - own.shape[1] : -3],
+    )
+    torch.testing.assert_close(upstream[2:], own[:-2])
+    torch.testing.assert_close(downstream[:-2], own[2:])
+    assert not upstream[:2].any()
+    assert not downstream[-2:].any()
+    place = torch.linspace(-1, 1, 15)
+    torch.testing.assert_close(inputs[:, -3:], torch.stack([place, place**2, 1 + 0 * place], 1))
+
+
+@pytest.mark.parametrize(("n", "reach"), [(5, 1), (5, 2), (3, 4)])
+def test_windows_are_those_of_a_padded_road_and_so_is_their_gradient(n, reach):
+    torch.manual_seed(0)
+    features = torch.randn(n, 3, 4, requires_grad=True)
+    padded = torch.nn.functional.pad(features, (0, 0, 0, 0, reach, reach))
+    expected = torch.cat([padded[i : i + n] for i in range(2 * reach + 1)], dim=1)
+    windows = Windows.apply(features, reach)
+    torch.testing.assert_close(windows, expected, rtol=0, atol=0)
+    weights = torch.randn_like(expected)
+    gradients = [
+        torch.autograd.grad((each * weights).sum(), features) for each in (windows, expected)
+    ]
+    torch.testing.assert_close(*gradients)
+
+
 def test_neighbours_and_the_whole_road_count():
     policy = make_policy()
-    channels = policy.features(observations(policy, 1)).requires_grad_()
-    scores = policy.scorer(channels, make_windows(channels, 1))
-    (gradient,) = torch.autograd.grad(scores[0, 7], channels)
-    seen = gradient[0].abs().sum(dim=1)
+    observation = observations(policy, 1).requires_grad_()
+    (gradient,) = torch.autograd.grad(policy.scores(observation)[0, 7], observation)
+    seen = gradient[0, :15].abs()  # of the density along the road
     near = seen[5:10]
     assert (near > 0).all()
     # Two convolutions of width 3 reach two segments; what is further counts by the mean alone.
@@ -231,13 +262,12 @@ def test_neighbours_and_the_whole_road_count():
 
 
 def test_segments_share_one_scorer():
-    """Shifted along a road without ramps, away from its ends, scores shift with the traffic."""
-    policy = make_policy()
-    channels = torch.zeros(1, 15, policy.features.n_channels)
-    channels[0, 7, :3] = 1.0
-    moved = channels.roll(1, dims=1)
-    scores, shifted = (policy.scorer(each, make_windows(each, 1)) for each in (channels, moved))
-    torch.testing.assert_close(shifted[:, 4:12], scores[:, 3:11])
+    """Away from its ends, scores shift with what the segments see."""
+    policy = make_policy("short-highway")
+    inputs = torch.randn(12, policy.features.n_inputs, 1)
+    scores = policy.scorer(inputs)
+    shifted = policy.scorer(inputs.roll(1, dims=0))
+    torch.testing.assert_close(shifted[:, 2:-1], scores[:, 1:-2])
 
 
 def test_policies_of_two_environments_share_their_weights():

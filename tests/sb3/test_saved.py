@@ -1,5 +1,7 @@
 """Saved policies: they act as before, where they fit, and files that mislead are refused."""
 
+import importlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,9 +12,22 @@ pytest.importorskip("sb3_contrib")
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
 
+from dptse_env.config import resolve
+from dptse_env.parts import make_interface
 from dptse_env.policies import read_policy
-from dptse_env.sb3 import SB3VecEnv, load_policy, save_policy, shipped_policies
+from dptse_env.sb3 import (
+    ActingPolicy,
+    RoadChannels,
+    SB3VecEnv,
+    load_policy,
+    save_policy,
+    shipped_policies,
+)
+from dptse_env.sb3.saved import KINDS
 from tests.helpers import ABOUT, SHORT, SumRelease, save_untrained, untrained
 from tests.hostile import check_hostile, check_refusals, edited
 
@@ -41,39 +56,161 @@ def observe(env):
     return observation
 
 
-@pytest.mark.parametrize(
-    ("action", "net_arch"),
-    [
-        ("slots", None),
-        ("scores", [8, 4]),
-        ("mask", {"pi": [8], "vf": [4, 4]}),
-        ("sequential", [16]),
-    ],
-)
-def test_a_loaded_policy_acts_as_the_saved_one(path, action, net_arch):
-    policy, config = untrained(action, net_arch=net_arch)
+CLASSES = {
+    "RoadPolicy": ("slots", {"road": ..., "width": 8}),
+    "ActorCriticPolicy": ("scores", {"net_arch": {"pi": [8], "vf": [4, 4]}}),
+    "MaskableActorCriticPolicy": ("sequential", {"net_arch": [16]}),
+    "RecurrentActorCriticPolicy": ("mask", {"lstm_hidden_size": 8, "activation_fn": nn.ReLU}),
+    "DQNPolicy": ("sequential", {"net_arch": [8]}),
+    "QRDQNPolicy": ("sequential", {"net_arch": [8], "n_quantiles": 5}),
+}
+
+
+def make(name):
+    """An untrained policy of a class that can be saved, its configuration, and its encoding."""
+    action, given = CLASSES[name]
+    config = resolve("short-highway", {"action": action})
+    interface = make_interface(config)
+    if "road" in given:
+        given = {**given, "road": RoadChannels.from_config(config)}
+    kind = getattr(importlib.import_module(KINDS[name].module), name)
+    torch.manual_seed(0)
+    policy = kind(interface.observations.space, interface.actions.space, lambda _: 1.0, **given)
+    return policy, config, action
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_a_loaded_policy_acts_as_the_saved_one(path, name):
+    policy, config, action = make(name)
     save_policy(path, policy, config, **ABOUT)
     env = make_env(action=action)
+    seen = np.stack([observe(env)] * 2)
+    seen[1] *= 0.5
     loaded = load_policy(path, env)
-    seen = observe(env)
-    batch = np.stack([seen, seen])
     extra = {}
-    if action == "sequential":
-        extra["action_masks"] = ~env.unwrapped.process.pending.picked
-    expected, _ = policy.predict(seen, deterministic=True, **extra)
-    np.testing.assert_array_equal(loaded.predict(seen, deterministic=True)[0], expected)
-    both, state = loaded.predict(batch, None, np.ones(2, bool), True)
-    np.testing.assert_allclose(both, [expected, expected], atol=1e-6)
-    assert state is None
-    if action == "slots":
-        scores = (each.scores(torch.tensor(batch)) for each in (loaded._policy, policy))
-        torch.testing.assert_close(*scores, rtol=0, atol=0)
-    draws = []
-    for acting in (policy, loaded):
-        torch.manual_seed(5)
-        draws.append(acting.predict(seen, **(extra if acting is policy else {}))[0])
-    np.testing.assert_array_equal(*draws)
-    env.step(expected)
+    if name == "MaskableActorCriticPolicy":
+        extra["action_masks"] = ~np.stack([env.unwrapped.process.pending.picked[0]] * 2)
+    states, start = [None, None], np.ones(2, bool)
+    for deterministic in (True, False):
+        taken = []
+        for k, (acting, more) in enumerate(((policy, extra), (loaded, {}))):
+            torch.manual_seed(5)
+            actions, states[k] = acting.predict(seen, states[k], start, deterministic, **more)
+            taken.append(actions)
+        np.testing.assert_array_equal(*taken)
+        start = np.zeros(2, bool)
+    assert (states[1] is None) == (name != "RecurrentActorCriticPolicy")
+    one, _ = loaded.predict(seen[0], deterministic=True)
+    np.testing.assert_allclose(one, policy.predict(
+        seen[0], deterministic=True, **{key: masks[:1] for key, masks in extra.items()}
+    )[0], atol=1e-6)  # fmt: skip
+    env.step(one)
+
+
+def test_what_only_a_training_needs_is_not_saved(path):
+    for name, rest in (("RoadPolicy", "critic"), ("DQNPolicy", "q_net_target")):
+        policy, config, _ = make(name)
+        save_policy(path, policy, config, **ABOUT)
+        saved, own = set(read_policy(path).weights), set(policy.state_dict())
+        assert own - saved == {key for key in own if key.startswith(rest)} != set()
+
+
+def test_normalisation_travels_in_the_file(path):
+    env = gym.make_vec(SHORT, num_envs=3, action="scores", autoreset_mode="SameStep")
+    scaled = VecNormalize(SB3VecEnv(env), clip_obs=2.0)
+    observation = scaled.reset()
+    for _ in range(20):
+        observation, *_ = scaled.step(np.zeros((3, 6), np.float32))
+    policy, config, _ = make("ActorCriticPolicy")
+    save_policy(path, policy, config, normalisation=scaled, **ABOUT)
+    seen = scaled.get_original_obs()
+    assert np.abs(observation).max() == 2.0
+    expected, _ = policy.predict(observation, deterministic=True)
+    in_training = ActingPolicy(policy, make_interface(config), normalisation=scaled)
+    for acting in (load_policy(path, env), in_training):
+        np.testing.assert_array_equal(acting.predict(seen)[0], expected)
+    assert (load_policy(path, env).predict(observation)[0] != expected).any()
+    save_policy(path, policy, config, normalisation=VecNormalize(SB3VecEnv(env), norm_obs=False),
+                **ABOUT)  # fmt: skip
+    np.testing.assert_array_equal(load_policy(path, env).predict(observation)[0], expected)
+    road, config, _ = make("RoadPolicy")
+    with pytest.raises(ValueError, match="cannot be saved: RoadPolicy scales observations itself"):
+        save_policy(path, road, config, normalisation=scaled, **ABOUT)
+
+
+def test_the_card_says_whether_actions_are_drawn(path):
+    policy, config, action = make("RoadPolicy")
+    env = make_env(action=action)
+    seen = np.stack([observe(env)] * 64)
+    for deterministic in (True, False):
+        save_policy(path, policy, config, deterministic=deterministic, **ABOUT)
+        loaded = load_policy(path, env)
+        assert loaded.deterministic == deterministic
+        for told, same in ((None, deterministic), (True, True), (False, False)):
+            actions, _ = loaded.predict(seen, deterministic=told)
+            assert (actions == actions[0]).all() == same
+
+
+def queried(policy, env, seconds=20):
+    """Options queried in each second of an episode."""
+    observation, _ = env.reset(seed=0)
+    start, state, found = True, None, []
+    while len(found) < seconds:
+        action, state = policy.predict(observation, state, np.array([start]))
+        before, start = env.unwrapped.process.time.copy(), False
+        observation, *_, info = env.step(action)
+        if (env.unwrapped.process.time > before).all():
+            assert info["n_dropped"] == 0
+            found.append(info["queried"].tolist())
+    return found
+
+
+@pytest.mark.parametrize("action", ["mask", "scores", "sequential"])
+def test_a_policy_asks_for_its_segments_in_another_encoding(stored, action):
+    env = make_env(action=action, bandwidth=2)
+    assert queried(load_policy(stored, env), env) == queried(
+        load_policy(stored, home := make_env(bandwidth=2)), home
+    )
+
+
+def test_a_policy_that_picks_one_by_one_acts_where_all_are_asked_for_at_once(path):
+    for name in ("MaskableActorCriticPolicy", "DQNPolicy"):
+        policy, config, action = make(name)
+        save_policy(path, policy, config, **ABOUT)
+        home, env = make_env(action=action), make_env(action="slots")
+        if name == "DQNPolicy":  # picks what it has picked already, and has it replaced
+            load_policy(path, env).predict(observe(env))
+        else:
+            expected = queried(load_policy(path, home), home)
+            assert queried(load_policy(path, env), env) == expected
+
+
+def test_a_memory_is_kept_from_second_to_second_in_another_encoding(path):
+    policy, config = recurrent("slots")
+    save_policy(path, policy, config, **ABOUT)
+    home, env = make_env(), make_env(action="sequential")
+    assert queried(load_policy(path, env), env) == queried(load_policy(path, home), home)
+
+
+def recurrent(action):
+    config = resolve("short-highway", {"action": action})
+    interface = make_interface(config)
+    torch.manual_seed(0)
+    policy = RecurrentActorCriticPolicy(
+        interface.observations.space, interface.actions.space, lambda _: 1.0, lstm_hidden_size=8
+    )
+    with torch.no_grad():
+        policy.action_net.weight *= 100.0  # the smallest changes of the memory count
+    return policy, config
+
+
+def test_encodings_that_cannot_be_translated_are_refused(tmp_path):
+    masks = save_untrained(tmp_path / "masks.safetensors", "mask")
+    with pytest.raises(ValueError, match=r"may query less .* with action='mask'"):
+        load_policy(masks, make_env())
+    scores = save_untrained(tmp_path / "scores.safetensors", "scores", **SPANS)
+    with pytest.raises(ValueError, match="where queries cost different amounts"):
+        load_policy(scores, make_env(action="sequential", **SPANS))
 
 
 def test_it_is_loaded_for_any_form_of_the_environment(stored):
@@ -108,7 +245,6 @@ def test_the_card_describes_the_policy(stored):
     ("keywords", "message"),
     [
         ({"bandwidth": 3}, r"bandwidth is 2 for the policy and 3 for the environment"),
-        ({"action": "mask"}, r"action is 'slots' for the policy and 'mask' for the environment"),
         (
             {"incident": "none"},
             r"corridor is 'short-highway \(6 .*\), traffic (\w{8})' for the policy and "
@@ -204,27 +340,29 @@ def arguments(**values):
 
 WRONG = {
     "slots": [
-        (lambda c, w: c["fits"].update(format="dptse-policy-2"), "format is 'dptse-policy-2'"),
-        (lambda c, w: c["fits"].update(action="x" * 10**5), "action is 'xxx"),
+        (lambda c, w: c["fits"].update(format="dptse-policy-1"), "format is 'dptse-policy-1'"),
+        (lambda c, w: c["fits"].update(action="x" * 10**5), "action must be one of .*xxx"),
         (lambda c, w: c["fits"]["channels"].append("colour"), r"channels is \['colour'\] for the"),
         (lambda c, w: c["fits"].update(channels=[{}] * 9), r"channels is \['\{\}'\] for the"),
         (lambda c, w: c["policy"].update({"class": "Oracle"}), "must be one of .*'Oracle'"),
-        (lambda c, w: c["policy"].update({"class": "ActorCriticPolicy"}), "must be net_arch"),
+        (lambda c, w: c["policy"].update({"class": "ActorCriticPolicy"}), "be layers, units, got"),
         (arguments(width=10**9), r"describe 4e\+18 weights, it has \d{3}"),
         (lambda c, w: (arguments(width=2000)(c, w), w.update(extra=np.zeros(2**22 - 2**14, "f4"))),
          r"describe 1\.6e\+07 weights, it has 4\d{6}"),
-        (arguments(width=7), "size mismatch for scorer.trunk.near.weight"),
+        (arguments(width=7), r"scorer\.\S+ must be float32 of shape"),
         (arguments(skips_sensors=1), "skips_sensors must be a bool"),
         (arguments(depth=3), "arguments must be reach, skips_sensors, width, got"),
-        (lambda c, w: w.update(extra=np.zeros(2, "f4")), r'Unexpected key\(s\) .*"extra"'),
-        (lambda c, w: w.pop("scorer.rule.weight"), r'Missing key\(s\) .*"scorer.rule.weight"'),
+        (lambda c, w: w.update(extra=np.zeros(2, "f4")), "it has the arrays extra"),
+        (lambda c, w: w.pop("scorer.rule.weight"), "it lacks the arrays scorer.rule.weight"),
     ],
     "mask": [
-        (arguments(net_arch=[12_000] * 3), r"describe 2\.\d+e\+08 weights, it has 2"),
-        (arguments(net_arch=[1] * 20_000), r"layers must be an integer in 0\.\.64, got 20000"),
-        (arguments(net_arch=[0]), r"an integer >= 1, got 0"),
-        (arguments(net_arch={"qf": [1]}), "net_arch must be a list of widths, or one each for pi"),
-        (arguments(net_arch=[[8]]), r"net_arch\[0\] must be an integer"),
+        (arguments(layers=[12_000] * 3), r"describe 2\.\d+e\+08 weights, it has 1"),
+        (arguments(layers=[1] * 20_000), r"number must be an integer in 0\.\.64, got 20000"),
+        (arguments(layers=[0]), r"an integer >= 1, got 0"),
+        (arguments(layers={"pi": [1]}), "layers must be a list of widths"),
+        (arguments(units="Linear"), "units must be one of Tanh, ReLU"),
+        (lambda c, w: c.update(acts="both"), "acts must be one of deterministic, drawn"),
+        (lambda c, w: w.update({"normalisation.clip": np.ones(())}), "lacks the arrays normal"),
         (lambda c, w: c["policy"].update({"class": "MaskableActorCriticPolicy"}),
          "acts by action encoding 'sequential', got 'mask'"),
     ],
@@ -290,7 +428,7 @@ def test_what_cannot_be_saved(stored):
         save_policy(stored.with_suffix(".pt"), policy, config, **ABOUT)
     with pytest.raises(ValueError, match="policy must be one of RoadPolicy"):
         save_policy(stored, torch.nn.Linear(1, 1), config, **ABOUT)
-    with pytest.raises(ValueError, match="weights must be of float32 alone"):
+    with pytest.raises(ValueError, match=r"scorer\.\S+ must be float32 of shape"):
         save_policy(stored, untrained()[0].double(), config, **ABOUT)
     long = {**ABOUT, "figures": {"notes": "x" * 2**21}}
     with pytest.raises(ValueError, match=r"cannot be written: its header must have at most"):
@@ -301,7 +439,7 @@ def test_what_cannot_be_saved(stored):
         save_policy(stored, policy, config, **ABOUT)
     perceptron, masked = untrained("mask")
     perceptron.extra = torch.nn.Linear(1, 1)
-    with pytest.raises(ValueError, match=r"cannot be saved: .*Unexpected key\(s\).*extra.weight"):
+    with pytest.raises(ValueError, match=r"cannot be saved: policy has weights of .*extra.weight"):
         save_policy(stored, perceptron, masked, **ABOUT)
     assert stored.read_bytes() == before
     assert [each.name for each in stored.parent.iterdir()] == [stored.name]

@@ -27,6 +27,7 @@ from tests.helpers import SHORT, fast_and_slow, save_untrained
 from tests.importers.data import plain, stream
 from tests.importers.network.conftest import motorway
 from tests.scripts.commands import ROOT, refused, run_command
+from tests.scripts.test_policy import save_model
 
 COMMANDS = [*MODULES, "import trajectories", "import network", "import field"]
 SCREEN = 48
@@ -72,6 +73,8 @@ def test_the_example_of_the_help_runs_as_it_is_printed(name, tmp_path, monkeypat
     if name == "fit":
         road = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
         (tmp_path / "my-road.toml").write_text(road)
+    if name == "policy":
+        save_model(tmp_path, bandwidth=1)
     if "--report" in line:
         shutil.copytree(ROOT / "results" / "paper", tmp_path / "results" / "paper")
     monkeypatch.chdir(tmp_path)

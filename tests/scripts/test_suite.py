@@ -47,6 +47,7 @@ def test_the_first_policy_that_suits_a_cell_acts_in_it(tmp_path):
         (("nobody",), "'nobody'"),
         (("static", "nobody"), "'nobody' acts in no cell"),
         (("static", "--beside", "nobody.json"), "nobody.json"),
+        (("static", "--cells", "none"), "cells must be one of"),
         ((), "policies must be one or more"),
     ],
 )
