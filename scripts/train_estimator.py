@@ -58,9 +58,8 @@ class Args(Machines):
     seeds: str = "0:3"
     """Training seeds, first:stop; the best network on validation traffic is taken."""
     env: tuple[str, ...] = ()
-    """Environments to train in, each an id or 'id {keywords as JSON}', with release model,
-    bandwidth and query policy drawn at random; nine roads if not given. Sections of random highways
-    come beside them."""
+    """Environments to train in, each an id or 'id {keywords as JSON}', beside sections of random
+    highways; nine roads if not given."""
     traffic: str = "0:32"
     """Traffic seeds to train on, first:stop, of 0 to 999."""
     validation_env: tuple[str, ...] = ()
@@ -70,11 +69,9 @@ class Args(Machines):
     rounds: tuple[str, ...] = ("own:96:64",) * 7
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
     initial: str | None = "highway"
-    """Pair of networks to begin with, as the estimator takes it, which also teaches on ordinary
-    roads. None begins with random weights; the first round must then be another estimator's."""
+    """Pair of networks to begin with, which also teaches; None for random weights."""
     plan: str = "{}"
-    """Further fields of the plan as JSON, such as '{"ranges": {"sections": 0.3}}'; see
-    agents/filters/plan.py."""
+    """Further fields of the plan (agents/filters/plan.py) as JSON."""
     output: Path = Path("results/network")
     """Folder of the trainings."""
 
