@@ -152,7 +152,7 @@ def test_estimators_and_keywords_reach_the_environment():
         (["--env", SURE, "--estimators", "ekf", "mhe"], "estimator_settings.process_noise[0] must"),
         (["--seeds", "2000:2000"], "seeds must be"),
         (["--policies", "a/b.safetensors", "c/a/b.safetensors"], "'a/b'"),
-        (["--policies", "nobody.zip"], "nobody.zip"),
+        (["--policies", "nobody.safetensors"], "nobody.safetensors"),
         (["--policies", "nobody"], "'nobody'"),
     ],
 )
