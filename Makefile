@@ -21,14 +21,13 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-DEMO = --env 'dptse_env:dptse/PaperHighway-v0 {"parameters": "w99-3lane"}'
+DEMO = --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}'
 
-demo: setup  ## Train a small query policy and evaluate it beside the schedules on held-out traffic; results/demo.
-	$(BIN)/dptse train $(DEMO) \
-		--traffic 0:32 --validation 1000:1008 --output results/demo/training \
-		--algorithm 'plackett-luce {"regression": {"rounds": 2, "batches": 600}, "swaps": {"rounds": 1, "episodes": 96, "batches": 300}}'
-	$(BIN)/dptse evaluate $(DEMO) --estimators ekf random_walk \
-		--policies results/demo/training/policy.safetensors --output results/demo --force
+demo: setup  ## Train a query policy with PPO for two minutes and evaluate it beside the rules on unseen traffic; results/demo.
+	$(BIN)/dptse train $(DEMO) --minutes 2 --algorithm 'ppo {"validations": 8}' \
+		--traffic 0:48 --validation 1000:1016 --output results/demo/training
+	$(BIN)/dptse evaluate $(DEMO) --policies results/demo/training/best.safetensors \
+		--seeds 2000:2032 --reference speed-front --output results/demo --force
 
 reproduce: setup  ## Write the reports of all studies anew, after playing what their rows lack; results/.
 	$(BIN)/dptse study paper

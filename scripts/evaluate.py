@@ -28,11 +28,21 @@ from agents.seeds import seed_kind
 from agents.statistics import Interval
 from agents.study import ROWS, TABLES, Study, read_rows
 from agents.study import run as run_study
-from agents.tables import DENSITY, ERROR, SPEED, difference, error_label, markdown, mean, values
+from agents.tables import (
+    DENSITY,
+    ERROR,
+    SPEED,
+    below,
+    difference,
+    error_label,
+    markdown,
+    mean,
+    values,
+)
 from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import parse_seeds
 from dptse_env.policies import DETERMINISTIC
-from dptse_env.schedules import OBSERVATION_SCHEDULES
+from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import require
 from scripts.cli import Environment, Machines
@@ -211,6 +221,29 @@ def print_scores(title: str, scores: Scores, reference: str) -> None:
         print_table(table)
 
 
+def verdict(rows: pl.DataFrame, own: Sequence[Score], cells: Sequence[Cell]) -> str:
+    """Return how the best learned policy stands to the best rule, in a line; empty without one.
+
+    Args:
+        rows: Of the evaluation.
+        own: Scores with an estimator, the least error first.
+        cells: Of that estimator.
+    """
+    known = {cell.labels["policy"]: cell for cell in cells}
+    is_rule = {n: isinstance(find_policy(c.policy), NamedSchedule) for n, c in known.items()}
+    ranked = [each for each in own if each.policy != ALL and each.policy not in ORACLES]
+    learned = next((each for each in ranked if not is_rule[each.policy]), None)
+    rule = next((each for each in ranked if is_rule[each.policy]), None)
+    if learned is None or rule is None or learned.means[ERROR].n == 1:
+        return ""
+    gain = below(rows, known[learned.policy].labels, known[rule.policy].labels)
+    return (
+        f"learned ({learned.policy}) {learned.means[ERROR].mean:.1f}, "
+        f"best rule ({rule.policy}) {rule.means[ERROR].mean:.1f}: {gain.mean:.1f} % below, "
+        f"95 % interval {gain.low:.1f} to {gain.high:.1f}, paired by traffic and noise"
+    )
+
+
 def draw_traffic(args: Args, title: str, scores: Scores, cells: Sequence[Cell]) -> None:
     """Draw the first traffic seed under some policies, and write the page if it is wanted.
 
@@ -259,12 +292,9 @@ def main(args: Args) -> None:
         cell.check()
     title, ids = make_title(cells[0], seeds), {cell.id for cell in cells}
 
-    def summarise(rows: pl.DataFrame) -> Scores:
-        # An interrupted evaluation may have left rows of other cells.
-        return score(rows.filter(pl.col("cell").is_in(ids)), cells, args.reference)
-
     def report(rows: pl.DataFrame, folder: Path) -> str:
-        scores = summarise(rows)
+        # An interrupted evaluation may have left rows of other cells.
+        scores = score(rows.filter(pl.col("cell").is_in(ids)), cells, args.reference)
         series = {
             name: {
                 each.policy: {error_label(metric): mean for metric, mean in each.means.items()}
@@ -281,16 +311,24 @@ def main(args: Args) -> None:
         (args.output / ROWS).unlink(missing_ok=True)
         shutil.rmtree(args.output / "rows", ignore_errors=True)
     run_study(Study("evaluation", tuple(cells), seeds, report), args.place(args.output))
-    scores = summarise(read_rows("evaluation", args.output))
+    rows = read_rows("evaluation", args.output).filter(pl.col("cell").is_in(ids))
+    scores = score(rows, cells, args.reference)
     if args.json:
-        rows = [
+        played = [
             {"estimator": estimator, **as_json(each)}
             for estimator, own in scores.items()
             for each in own
         ]
-        found = {"title": title, "reference": args.reference, "rows": rows}
+        found = {"title": title, "reference": args.reference, "rows": played}
         print(json.dumps(found, indent=2))
         return
     print_scores(title, scores, args.reference)
+    for estimator, own in scores.items():
+        said = verdict(rows, own, [c for c in cells if c.labels["estimator"] == estimator])
+        if said:
+            print(said)
     page = f"; a browser opens {args.output / PAGE}" if args.html else ""
-    print(f"tables and figures are in {args.output}/{page}")
+    print(
+        f"tables are in {args.output}/, errors with bars in {args.output / ERRORS}, queries over "
+        f"space and time in {args.output / MAPS}{page}"
+    )

@@ -15,10 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.training.episodes import TrainingEpisodes
-from agents.training.plan import Regression
+from agents.training.settings import Regression
 from dptse_env.process import QueryProcess
-from dptse_env.sb3 import RoadPolicy
+from dptse_env.sb3 import RoadPolicy, SB3VecEnv
 from dptse_env.utils.arrays import FloatArray, Observation
 
 FLOOR = 1e-4
@@ -65,7 +64,7 @@ class Practice:
         errors: Squared errors of the same seconds, each (n, n_mainline).
     """
 
-    def __init__(self, policy: RoadPolicy, episodes: TrainingEpisodes, batch_size: int) -> None:
+    def __init__(self, policy: RoadPolicy, episodes: SB3VecEnv, batch_size: int) -> None:
         """Begin the episodes."""
         self.policy, self.batch_size = policy, batch_size
         self.seen: list[Tensor] = []

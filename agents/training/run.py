@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
+from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.environments import make_vector
+from agents.figures import COLOURS, GREY, finish_figure, make_figure, save_figure
+from agents.files import write_json
+from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
-from agents.training.plan import TrainingPlan
 from agents.training.run_files import (
     Row,
     keep_plan,
@@ -22,20 +28,33 @@ from agents.training.run_files import (
     write_checkpoint,
     write_progress,
 )
+from agents.training.settings import TrainingPlan
 from dptse_env.evaluation import evaluate
 from dptse_env.parts import make_interface
-from dptse_env.sb3.saved import ActingPolicy, save_policy
+from dptse_env.sb3 import ActingPolicy, save_policy
 from dptse_env.traffic import Records
+from dptse_env.utils.fields import read_json, require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 POLICY, BEST = "policy.safetensors", "best.safetensors"
 """The last policy, and the one of least error in validation."""
 
+CURVE, RULES_FILE, TENSORBOARD = "curve.png", "rules.json", "tensorboard"
+
+RULES = (
+    "round-robin", "stale-variance", "largest-deviation", "speed-front", "expected-reduction",
+)  # fmt: skip
+"""Rules whose errors on validation traffic a training is shown beside."""
+
 Watcher = Callable[[Row], None]
 """Receives every row of the learning curve as it comes."""
 
-Progress = Callable[[str, float], None]
-"""Called between two rows with the name of a stage and the fraction of it that is done."""
+Progress = Callable[[float, str], None]
+"""Called with the fraction of a training that is done, and the name of its stage, if it has any."""
+
+
+def silent(fraction: float, stage: str) -> None:
+    """Show no progress."""
 
 
 class Run:
@@ -47,6 +66,7 @@ class Run:
         checkpoint: What `keep` was given last, by an earlier process; None where there was none.
         keywords: Further keywords of all environments that are trained in.
         progress: Told of stages.
+        rules: Errors of rules on validation traffic, by name.
     """
 
     def __init__(
@@ -57,7 +77,7 @@ class Run:
         watchers: Sequence[Watcher],
         progress: Progress,
     ) -> None:
-        """Take the folder, and read what it has; the arguments are those of `train`.
+        """Take the folder, read what it has, and play the rules; arguments are those of `train`.
 
         Raises:
             ValueError: The folder belongs to another plan, or its checkpoint is damaged.
@@ -73,44 +93,67 @@ class Run:
             "traffic_seeds": list(plan.traffic_seeds),
         }
         self._folder, self._watchers = folder, watchers
+        self.rules = keep_rules(plan, folder, records, progress)
         self.rows: list[Row] = []
         for row in self.checkpoint["rows"] if self.checkpoint else ():
             self._append(row)
-        known = [row["validation"] for row in self.rows if "validation" in row]
-        self._best = min(known, default=np.inf)
+        self._best = min(map(least, self.rows), default=np.inf)
+        # The clock of the training starts when the rules have been played.
         self._begun = time.perf_counter() - (self.rows[-1]["seconds"] if self.rows else 0.0)
 
-    def add(self, update: int, steps: int, values: Row) -> None:
+    @property
+    def steps(self) -> int:
+        """Seconds of traffic that were simulated up to the last row."""
+        return int(self.rows[-1]["steps"]) if self.rows else 0
+
+    def done(self, steps: int) -> float:
+        """Return the fraction of a training by minutes or by steps that is done."""
+        if self.plan.minutes is not None:
+            return min((time.perf_counter() - self._begun) / (60.0 * self.plan.minutes), 1.0)
+        assert self.plan.steps is not None
+        return min(steps / self.plan.steps, 1.0)
+
+    def add(self, steps: int, values: Row) -> None:
         """Add a row to the curve.
 
         Args:
-            update: Number of updates, or of rounds, that are done.
-            steps: Seconds of traffic that were simulated for them, all environments together.
+            steps: Seconds of traffic that were simulated for it, all environments together.
             values: Further columns.
         """
         seconds = round(time.perf_counter() - self._begun, 1)
-        self._append({"update": update, "steps": steps, "seconds": seconds, **values})
+        row = {"update": len(self.rows), "steps": steps, "seconds": seconds, **values}
+        self._append(row)
+        if self._board is not None:
+            self._board.write(row, dict.fromkeys(row, ()), steps)
 
-    def validate(self, policies: Sequence[BasePolicy], steps: int) -> Row:
-        """Return errors on validation traffic; save the first policy where they are the least yet.
+    def validate(
+        self, policies: Sequence[BasePolicy], steps: int, scaled: VecNormalize | None = None
+    ) -> Row:
+        """Return errors on validation traffic; save the first policy, as the best if it is.
 
         An error is minus the mean reward of a second after the warm-up: for the joint reward the
         normalised RMSE of density and speed together. Several environments count alike. Draws of
         torch are seeded, and its generator is left as found.
+
+        Args:
+            policies: Of the environments of the plan.
+            steps: Seconds of traffic that they were trained for.
+            scaled: Has the statistics of their observations.
         """
         row: Row = {"steps": steps}
         for column, deterministic in (("validation", True), ("validation_drawn", False)):
             errors = [
-                self._error(env, policy, deterministic)
+                self._error(env, policy, deterministic, scaled)
                 for env, policy in zip(self._environments, policies, strict=True)
             ]
             row[column] = float(np.mean(errors))
             if len(errors) > 1:
                 names = [f"{column} in {world}" for world in self.plan.worlds]
                 row |= dict(zip(names, errors, strict=True))
-        if row["validation"] < self._best:
-            self._best = row["validation"]
-            self.save(BEST, policies[0], row)
+        self._save(POLICY, policies[0], row, scaled)
+        if least(row) < self._best:
+            self._best = least(row)
+            self._save(BEST, policies[0], row, scaled)
         return row
 
     def keep(self, **content: Any) -> None:
@@ -122,8 +165,16 @@ class Run:
         write_checkpoint(self._folder, {"rows": self.rows, **content})
         write_progress(self._folder, self.rows)
 
-    def save(self, name: str, policy: BasePolicy, row: Row) -> None:
-        """Write a policy with the seconds of traffic and the errors of its row of the curve."""
+    def finish(self) -> None:
+        """Draw the curve, with the rules as lines."""
+        title = f"{self.plan.algorithm.name} in {self.plan.worlds[0]}, validation traffic"
+        save_figure(draw_curve(self.rows, self.rules), self._folder / CURVE, title)
+
+    def _save(self, name: str, policy: BasePolicy, row: Row, scaled: VecNormalize | None) -> None:
+        """Write a policy with the seconds of traffic and the errors of its row of the curve.
+
+        It acts by its likeliest actions or draws them, whichever erred less.
+        """
         plan, world = self.plan, self.plan.worlds[0]
         save_policy(
             self._folder / name,
@@ -140,12 +191,20 @@ class Run:
                 "validation seeds": _range(plan.validation_seeds),
             },
             figures={key: row[key] for key in row if key.startswith("validation")},
+            normalisation=scaled,
+            deterministic=row["validation"] <= row["validation_drawn"],
         )
 
     def _append(self, row: Row) -> None:
         self.rows.append(row)
         for watcher in self._watchers:
             watcher(row)
+
+    @cached_property
+    def _board(self) -> TensorBoardOutputFormat | None:
+        if importlib.util.find_spec("tensorboard") is None:
+            return None
+        return TensorBoardOutputFormat(str(self._folder / TENSORBOARD))
 
     @cached_property
     def _environments(self) -> list[SensorQueryVectorEnv]:
@@ -156,13 +215,83 @@ class Run:
             for world in self.plan.worlds
         ]
 
-    def _error(self, env: SensorQueryVectorEnv, policy: BasePolicy, deterministic: bool) -> float:
-        acting = ActingPolicy(policy, make_interface(env.config))
+    def _error(
+        self,
+        env: SensorQueryVectorEnv,
+        policy: BasePolicy,
+        deterministic: bool,
+        scaled: VecNormalize | None,
+    ) -> float:
+        acting = ActingPolicy(policy, make_interface(env.config), normalisation=scaled)
         seeds, noise = self.plan.validation_seeds, TRAINING_VALIDATION.start
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(noise)
             rows = evaluate(env, acting, seeds, noise, deterministic=deterministic)
         return -float(np.mean([row["reward"] for row in rows]))
+
+
+def least(row: Row) -> float:
+    """Return the smaller error of a row: of likeliest actions, or of drawn ones."""
+    return min(row["validation"], row["validation_drawn"])
+
+
+def keep_rules(
+    plan: TrainingPlan, folder: Path, records: Records, progress: Progress = silent
+) -> dict[str, float]:
+    """Return the errors of `RULES` on validation traffic, which are played once for a folder.
+
+    A rule that does not suit an environment, such as one for single segments, is left out.
+
+    Raises:
+        ValueError: The folder's file of them is damaged.
+    """
+    path = folder / RULES_FILE
+    if path.exists():
+        kept: dict[str, float] = read_json(path)
+        require(isinstance(kept, dict) and len(kept) > 0, str(path), "errors by rule", kept)
+        return kept
+    errors: dict[str, float] = {}
+    for rule in RULES:
+        cells = [
+            Cell(world.env, rule, world.keywords, noise_seed=TRAINING_VALIDATION.start)
+            for world in plan.worlds
+        ]
+        try:
+            for cell in cells:
+                cell.check()
+        except ValueError:
+            continue
+        progress(0.0, rule)
+        rewards = [
+            [row["reward"] for row in play(cell, plan.validation_seeds, records)] for cell in cells
+        ]
+        errors[rule] = -float(np.mean(rewards))
+    write_json(path, errors)
+    return errors
+
+
+def draw_curve(rows: Sequence[Row], rules: Mapping[str, float]) -> Figure:
+    """Draw errors on validation traffic over the seconds of traffic that were simulated."""
+    figure = make_figure(6.4, 4.0)
+    axis = figure.subplots()
+    steps = [row["steps"] for row in rows]
+    columns = (("validation", "likeliest actions"), ("validation_drawn", "drawn actions"))
+    for (column, label), colour in zip(columns, COLOURS, strict=False):
+        errors = [1000.0 * row[column] for row in rows]
+        axis.plot(steps, errors, color=colour, label=label, marker=".")
+    for rule, error in sorted(rules.items(), key=lambda each: each[1]):
+        axis.axhline(1000.0 * error, color=GREY, linestyle=":", linewidth=1.0)
+        axis.annotate(
+            rule, (1.0, 1000.0 * error), xycoords=("axes fraction", "data"), fontsize=7,
+            va="bottom", ha="right",
+        )  # fmt: skip
+    # What an untrained policy takes for likeliest may err far more than anything else.
+    shown = [1000.0 * each for each in (*rules.values(), *map(least, rows))]
+    margin = 0.1 * (max(shown) - min(shown))
+    axis.set_ylim(min(shown) - margin, max(shown) + margin)
+    axis.set_xlabel("seconds of traffic", fontsize=9)
+    axis.set_ylabel("error x 1000", fontsize=9)
+    return finish_figure(figure)
 
 
 def _range(seeds: tuple[int, ...]) -> str:

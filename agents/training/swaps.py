@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from agents.seeds import training_seed
-from agents.training.plan import SwapRounds, first_second
+from agents.training.settings import SwapRounds, first_second
 from dptse_env.evaluation import Policy
 from dptse_env.process import QueryProcess
 from dptse_env.sb3 import RoadPolicy

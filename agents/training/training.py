@@ -6,27 +6,21 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+import gymnasium as gym
 import torch
 
 from agents.environments import make_vector
 from agents.executors import AnyExecutor, ExecutorError, run_shown
+from agents.files import write_json
 from agents.play import record
 from agents.seeds import training_seed
-from agents.training.episodes import make_episodes
-from agents.training.plan import (
-    Algorithm,
-    MaskablePPOSettings,
-    PlackettLuceSettings,
-    PPOSettings,
-    Regression,
-    TrainingPlan,
-)
-from agents.training.ppo import train_by_ppo
+from agents.training.learning import learn
 from agents.training.regression import Practice, regress
-from agents.training.run import POLICY, Progress, Run, Watcher
-from agents.training.run_files import Row, check_plan, read_checkpoint
+from agents.training.run import POLICY, RULES_FILE, Progress, Run, Watcher, keep_rules, silent
+from agents.training.run_files import Row, check_plan, keep_plan, read_checkpoint
+from agents.training.settings import PlackettLuceSettings, TrainingPlan
 from agents.training.swaps import raise_scores, try_swaps
-from dptse_env.sb3 import RoadPolicy
+from dptse_env.sb3 import RoadPolicy, SB3VecEnv
 from dptse_env.traffic import Records
 
 
@@ -36,21 +30,22 @@ def train(
     *,
     records: Records = None,
     watchers: Sequence[Watcher] = (),
-    progress: Progress = lambda stage, fraction: None,
+    progress: Progress = silent,
 ) -> list[Row]:
     """Train to the end of a plan in its folder, and return the learning curve.
 
-    The folder gets ``plan.json``, ``checkpoint.pt``, ``progress.csv`` (the curve),
-    ``best.safetensors`` and ``policy.safetensors`` (the policy best in validation, and the last).
-    What is there already is gone on with.
+    The folder gets ``plan.json``, ``rules.json`` (errors of rules on validation traffic),
+    ``checkpoint.pt``, ``progress.csv`` and ``curve.png`` (the learning curve),
+    ``best.safetensors`` and ``policy.safetensors`` (the policy best in validation, and the last),
+    and ``tensorboard`` where that is installed. What is there already is gone on with.
 
     Args:
         plan: The plan.
         folder: The folder; made if it is missing.
         records: Library of records, or its folder; None for the user's cache.
         watchers: Receive every row of the curve, those of the checkpoint first.
-        progress: Called between two rows with the name of a stage and the fraction of it that is
-            done.
+        progress: Called between two rows with the fraction of the training that is done and the
+            name of a stage.
 
     Raises:
         ValueError: The algorithm cannot train in the environments, the folder belongs to another
@@ -58,7 +53,8 @@ def train(
         OSError: The folder cannot be written; the last checkpoint stays.
     """
     run = Run(plan, folder, records, watchers, progress)
-    TRAINERS[type(plan.algorithm)](run)
+    (train_in_rounds if isinstance(plan.algorithm, PlackettLuceSettings) else learn)(run)
+    run.finish()
     return run.rows
 
 
@@ -79,13 +75,17 @@ def train_in_rounds(run: Run) -> None:
         policies[0].load_state_dict(kept["policy"])
         torch.set_rng_state(kept["torch"])
 
-    def end(update: int, steps: int, values: Row) -> None:
-        errors = run.validate(policies, steps)
-        run.add(update, steps, {**values, **errors})
-        run.keep(update=update, policy=policies[0].state_dict(), torch=torch.get_rng_state())
+    def end(steps: int, values: Row) -> None:
+        run.add(steps, {**values, **run.validate(policies, steps)})
+        run.keep(policy=policies[0].state_dict(), torch=torch.get_rng_state())
+
+    def show(stage: str, fraction: float) -> None:
+        # A round's swaps and its fit count alike, and the regression as one round.
+        part = fraction if stage == "regression" else 0.5 * (fraction + (stage == "fit"))
+        run.progress((len(run.rows) + part) / (algorithm.swaps.rounds + 1), stage)
 
     if kept is None:
-        end(0, _regress(run, algorithm.regression, policies), {})
+        end(_regress(run, algorithm, policies, partial(show, "regression")), {})
     done, settings = len(run.rows) - 1, algorithm.swaps
     environments = [
         make_vector(world.env, world.part(settings.episodes), {**world.keywords, **run.keywords})
@@ -97,35 +97,35 @@ def train_in_rounds(run: Run) -> None:
     seconds *= 1 + 2 * (1 + settings.trials)
     for index in range(done, settings.rounds):
         tried = [
-            try_swaps(policy, env, settings, index, plan.seed, partial(run.progress, "swaps"))
+            try_swaps(policy, env, settings, index, plan.seed, partial(show, "swaps"))
             for policy, env in zip(policies, environments, strict=True)
         ]
         step = settings.step_of(index)
-        raise_scores(policies, tried, settings, step, partial(run.progress, "fit"))
+        raise_scores(policies, tried, settings, step, partial(show, "fit"))
         error = sum(float(swaps.error.mean()) for swaps in tried) / len(tried)
-        end(index + 1, int(run.rows[-1]["steps"]) + seconds, {"error": error})
-    run.save(POLICY, policies[0], run.rows[-1])
+        end(run.steps + seconds, {"error": error})
 
 
-def _regress(run: Run, settings: Regression, policies: Sequence[RoadPolicy]) -> int:
+def _regress(
+    run: Run,
+    algorithm: PlackettLuceSettings,
+    policies: Sequence[RoadPolicy],
+    progress: Callable[[float], None],
+) -> int:
     """Do the regression; return the seconds of traffic that it took. Its memory is freed then."""
+    settings = algorithm.regression
     if not settings.rounds:
         return 0
     practice, seconds = [], 0
     for world, policy in zip(run.plan.worlds, policies, strict=True):
-        episodes = make_episodes(run.plan, world, run.keywords)
+        given = {**world.keywords, **run.keywords, "autoreset_mode": "SameStep"}
+        n = world.part(algorithm.n_envs, algorithm.replicas)
+        episodes = SB3VecEnv(gym.make_vec(world.env, num_envs=n, **given), algorithm.replicas)
+        episodes.seed(training_seed(run.plan.seed))
         practice.append(Practice(policy, episodes, world.part(settings.batch_size)))
-        seconds += episodes.num_envs * settings.seconds * settings.rounds
-    regress(practice, settings, partial(run.progress, "regression"))
+        seconds += n * settings.seconds * settings.rounds
+    regress(practice, settings, progress)
     return seconds
-
-
-TRAINERS: dict[type[Algorithm], Callable[[Run], None]] = {
-    PlackettLuceSettings: train_in_rounds,
-    PPOSettings: train_by_ppo,
-    MaskablePPOSettings: train_by_ppo,
-}
-"""Functions that train, by the type of the algorithm's settings."""
 
 
 def train_all(
@@ -142,8 +142,8 @@ def train_all(
     the training goes on from its last checkpoint.
 
     Args:
-        plans: Plans by folder; folders are made where they are missing. Nodes of a cluster have to
-            share them.
+        plans: Plans by folder, which differ in their seeds alone. Folders are made where they are
+            missing; nodes of a cluster have to share them.
         executor: Runs the trainings.
         records: Library of records, or its folder; None for the user's cache.
         threads: Threads of torch in each training; numbers depend on it in the last digits.
@@ -157,6 +157,12 @@ def train_all(
     for folder, plan in plans.items():
         read_checkpoint(folder)
         check_plan(folder, plan.content())
+    for folder, plan in plans.items():
+        keep_plan(folder, plan.content())
+    first = next(iter(plans))
+    rules = keep_rules(plans[first], first, records)
+    for folder in plans:
+        write_json(folder / RULES_FILE, rules)
     work = partial(_train_there, records=records, threads=threads)
     tasks = [(plan, folder.absolute()) for folder, plan in plans.items()]
 

@@ -151,8 +151,8 @@ def test_estimators_and_keywords_reach_the_environment():
         # The first could be played.
         (["--env", SURE, "--estimators", "ekf", "mhe"], "estimator_settings.process_noise[0] must"),
         (["--seeds", "2000:2000"], "seeds must be"),
-        (["--policies", "a/b.zip", "c/a/b.zip"], "'a/b'"),
-        (["--policies", "nobody.zip"], "nobody.zip"),
+        (["--policies", "a/b.safetensors", "c/a/b.safetensors"], "'a/b'"),
+        (["--policies", "nobody.safetensors"], "nobody.safetensors"),
         (["--policies", "nobody"], "'nobody'"),
     ],
 )

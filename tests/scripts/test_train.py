@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,8 +15,7 @@ pytest.importorskip("sb3_contrib")
 pytest.importorskip("tyro")
 
 from agents.training.run_files import read_progress
-from scripts.training_bar import Bar, watched
-from tests.agents.training.plans import SMALL, without_time
+from tests.agents.training.plans import SMALL, STEPS, without_time
 from tests.helpers import SHORT
 from tests.scripts.commands import refused, run_command
 
@@ -23,21 +23,53 @@ ROOT = Path(__file__).parents[2]
 
 
 def words(output, algorithm="plackett-luce", *more):
-    settings = {**SMALL[algorithm], **({"steps": 960} if algorithm == "ppo" else {})}
+    length = () if algorithm == "plackett-luce" else ("--steps", str(STEPS))
     return [
-        "--env", f'{SHORT} {{"horizon": 64}}', "--algorithm", f"{algorithm} {json.dumps(settings)}",
+        "--env", SHORT, "--keywords", '{"horizon": 64}', *length,
+        "--algorithm", f"{algorithm} {json.dumps(SMALL[algorithm])}",
         "--traffic", "0:2", "--validation", "1000:1001", "--output", str(output), *more,
     ]  # fmt: skip
 
 
 def test_it_trains_and_goes_on(tmp_path):
-    done = run_command("train", *words(tmp_path / "one"))
+    given = words(tmp_path / "one", "ppo")
+    done = run_command("train", *given)
     assert done.returncode == 0, done.stderr
-    assert f"{tmp_path / 'one'}: error x 1000 in validation" in done.stdout
+    said = re.fullmatch(
+        r"(.*): error x 1000 in validation ([\d.]+), ([a-z-]+) ([\d.]+): ([\d.]+) % (b|a)\w+; .*",
+        done.stdout.strip(),
+    )
+    assert said[1] == str(tmp_path / "one")
+    rules = json.loads((tmp_path / "one" / "rules.json").read_text())
+    assert said[3] == min(rules, key=rules.get)
+    assert float(said[4]) == pytest.approx(1000 * rules[said[3]], abs=0.06)
+    away = float(said[5]) * (1 if said[6] == "b" else -1)
+    assert away == pytest.approx(100 * (1 - float(said[2]) / float(said[4])), abs=0.2)
+    # The bar has the error beside the best rule's.
+    assert f"validation={said[2]}" in done.stderr
+    assert f"{said[3]}={said[4]}" in done.stderr
     before = (tmp_path / "one" / "policy.safetensors").read_bytes()
-    assert run_command("train", *words(tmp_path / "one")).stdout == done.stdout
+    assert run_command("train", *given).stdout == done.stdout
     assert (tmp_path / "one" / "policy.safetensors").read_bytes() == before
-    assert "seed is 0 there and 1 now" in refused("train", *words(tmp_path / "one"), "--seeds", "1")
+    assert "seed is 0 there and 1 now" in refused("train", *given, "--seeds", "1")
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--algorithm", "dqn"], "algorithm must be one of ppo, .*, plackett-luce where bandwidth"),
+        (["--minutes", "0"], "minutes must be a finite number > 0, got 0"),
+        (["--steps", "-3"], "steps must be an integer >= 1, got -3"),
+        (["--traffic", "998:1001"], r"traffic must be traffic seeds in 0\.\.999, got 1000"),
+        (["--validation", "2000"], r"validation must be traffic seeds in 1000\.\.1999, got 2000"),
+        (["--keywords", "3"], "keywords must be a JSON object, got"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(more, message, tmp_path):
+    output = tmp_path / "out"
+    line = refused("train", "--env", SHORT, "--output", output, *more)
+    assert re.search(message, line)
+    assert not output.exists()
 
 
 def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
@@ -69,7 +101,7 @@ def test_a_killed_program_goes_on(tmp_path, how, algorithm):
         time.sleep(0.01)
     process.send_signal(how)
     _, err = process.communicate(timeout=240)
-    assert process.returncode == (130 if how == signal.SIGINT else -how)
+    assert process.returncode == (130 if how == signal.SIGINT else -how), err
     assert how == signal.SIGKILL or "the same command goes on" in err
     curves = []
     for run in ("killed", "whole"):
@@ -80,22 +112,3 @@ def test_a_killed_program_goes_on(tmp_path, how, algorithm):
     assert [row["update"] for row in curves[0]] == [row["update"] for row in curves[1]]
     if algorithm == "plackett-luce":
         assert curves[0] == curves[1]
-
-
-ROWS = [{"update": k, "steps": 40 * k, "error": 0.5} for k in range(3)]
-
-
-def test_the_bar_follows_the_curve(tmp_path, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with watched(Bar("update", ("error", "validation"), 2), tmp_path) as (bar,):
-        for row in ROWS:
-            bar(row)
-    assert bar.bar.n == 2
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_tensorboard_follows_the_curve_where_it_is_installed(tmp_path):
-    pytest.importorskip("tensorboard")
-    with watched(Bar("update", ("error",), 2), tmp_path) as (_, write):
-        write(ROWS[1])
-    assert list(tmp_path.glob("tensorboard/events*"))

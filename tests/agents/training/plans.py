@@ -4,10 +4,11 @@ import json
 import os
 import signal
 
-from agents.training.plan import TrainingPlan, parse_algorithm
+from agents.training.settings import PlackettLuceSettings, TrainingPlan, parse_algorithm
 from tests.helpers import SHORT
 
 ENV = f'{SHORT} {{"horizon": 80, "privacy": "capped"}}'
+ONE = f'{SHORT} {{"horizon": 80, "privacy": "capped", "bandwidth": 1}}'
 WIDE = f'{SHORT} {{"horizon": 80, "privacy": "capped", "bandwidth": 3}}'
 OTHER = 'dptse_env:dptse/PrivateHighway-v1 {"horizon": 80, "privacy": "capped", "bandwidth": 3}'
 """A road of 15 segments beside one of 6; both have the same kinds of channels."""
@@ -23,25 +24,35 @@ SMALL = {
         },
     },
     "ppo": {
-        "n_envs": 4, "replicas": 2, "steps": 240, "n_steps": 10, "batch_size": 20, "n_epochs": 2,
-        "hidden": [8], "validate_every": 2,
+        "n_envs": 4, "replicas": 2, "n_steps": 10, "batch_size": 20, "n_epochs": 2, "hidden": [8],
+        "validations": 3,
+    },
+    "dqn": {
+        "n_envs": 4, "replicas": 2, "train_freq": 10, "batch_size": 20, "buffer_size": 400,
+        "learning_starts": 20, "hidden": [8], "validations": 3,
     },
 }  # fmt: skip
 SMALL["maskable-ppo"] = SMALL["ppo"]
+SMALL["recurrent-ppo"] = {**SMALL["ppo"], "lstm": 8}
+SMALL["qr-dqn"] = {**SMALL["dqn"], "quantiles": 5}
+STEPS = 240
+"""Seconds of traffic of a small training but for plackett-luce: six updates."""
 
 
 def make_algorithm(name="plackett-luce", **changes):
-    return parse_algorithm(f"{name} {json.dumps({**SMALL[name], **changes})}")
+    return parse_algorithm(f"{name} {json.dumps({**SMALL[name], **changes})}", 6)
 
 
 def make_plan(algorithm="plackett-luce", **changes):
     """A plan with an algorithm, or the small settings of one by its name."""
+    algorithm = make_algorithm(algorithm) if isinstance(algorithm, str) else algorithm
     values = {
-        "envs": (ENV,),
-        "algorithm": make_algorithm(algorithm) if isinstance(algorithm, str) else algorithm,
+        "envs": (ONE if "dqn" in algorithm.name else ENV,),
+        "algorithm": algorithm,
         "seed": 1,
         "traffic_seeds": (0, 1, 2),
         "validation_seeds": (1000, 1001),
+        "steps": None if isinstance(algorithm, PlackettLuceSettings) else STEPS,
     }
     return TrainingPlan(**{**values, **changes})
 

@@ -6,22 +6,23 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents.training.episodes import make_episodes
 from agents.training.regression import RULE, Practice, regress, squared_errors
-from dptse_env.sb3 import RoadPolicy
-from tests.agents.training.plans import make_algorithm, make_plan
+from agents.training.settings import Regression
+from dptse_env.sb3 import RoadPolicy, SB3VecEnv
 from tests.helpers import SHORT
 
 
 def make(**changes):
-    settings = {"rounds": 1, "seconds": 119, "interval": 1, "batches": 200, "batch_size": 64}
-    algorithm = make_algorithm(n_envs=8, replicas=1, regression={**settings, **changes})
-    plan = make_plan(algorithm=algorithm, envs=(f'{SHORT} {{"privacy": "capped"}}',))
-    keywords = {"traffic_seeds": "0:3", "action": "slots"}
-    episodes = make_episodes(plan, plan.worlds[0], keywords)
+    few = {"rounds": 1, "seconds": 119, "interval": 1, "batches": 200, "batch_size": 64}
+    env = gym.make_vec(
+        SHORT, num_envs=8, autoreset_mode="SameStep", traffic_seeds="0:3", action="slots",
+        privacy="capped",
+    )  # fmt: skip
+    episodes = SB3VecEnv(env)
+    episodes.seed(1)
     torch.manual_seed(0)
-    policy = RoadPolicy.from_config(episodes.env.config, width=8)
-    return algorithm.regression, Practice(policy, episodes, 64)
+    policy = RoadPolicy.from_config(env.config, width=8)
+    return Regression(**{**few, **changes}), Practice(policy, episodes, 64)
 
 
 def queried_variance(process):

@@ -9,7 +9,7 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from agents.seeds import training_seed
-from agents.training.plan import SwapRounds
+from agents.training.settings import SwapRounds
 from agents.training.swaps import LARGEST_GAIN, Swaps, raise_scores, try_swaps
 from dptse_env.config import resolve
 from dptse_env.sb3 import RoadPolicy

@@ -15,19 +15,24 @@ pytest.importorskip("sb3_contrib")
 
 import gymnasium as gym
 import torch
+from PIL import Image
 
 from agents.environments import make_vector
 from agents.executors import THIS_PROCESS, ExecutorError, ThisProcess
+from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
-from agents.training.plan import ALGORITHMS
-from agents.training.run import BEST, POLICY, Run
+from agents.training.run import BEST, CURVE, POLICY, RULES, RULES_FILE, Run, silent
 from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_checkpoint, read_progress
+from agents.training.settings import ALGORITHMS, parse_algorithm
 from agents.training.training import train, train_all
 from dptse_env.evaluation import evaluate
-from dptse_env.sb3 import load_policy
+from dptse_env.sb3 import ReplicaBaseline, load_policy
+from dptse_env.utils.files import read_tensors
 from tests.agents.elsewhere import Elsewhere
 from tests.agents.training.plans import (
     ENV,
+    SMALL,
+    STEPS,
     WIDE,
     StopError,
     kill_at,
@@ -39,6 +44,7 @@ from tests.agents.training.plans import (
 from tests.helpers import SHORT, fast_and_slow
 from tests.test_non_interference import blind, make_private, unlike
 
+PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
 KEYWORDS = {"horizon": 80, "privacy": "capped"}
 POLICIES = (POLICY, BEST)
 
@@ -108,58 +114,61 @@ def test_a_full_disk_leaves_a_folder_to_go_on_in(whole, tmp_path, monkeypatch):
     stages, seen = [], []
     rows = train(
         make_plan(), tmp_path / "full", watchers=(seen.append,),
-        progress=lambda stage, fraction: stages.append((stage, 0.0 <= fraction <= 1.0)),
+        progress=lambda fraction, stage: stages.append((stage, 0.3 <= fraction <= 1.0)),
     )  # fmt: skip
     assert set(stages) == {("swaps", True), ("fit", True)}  # the regression is not done again
     assert seen == rows
     assert_alike(tmp_path / "full", whole()[0])
 
 
-def test_a_finished_training_is_left_alone(whole, tmp_path):
-    folder = shutil.copytree(whole()[0], tmp_path / "run")
+@pytest.mark.parametrize("name", ["plackett-luce", "ppo"])
+def test_a_finished_training_is_left_alone(name, whole, tmp_path):
+    folder = shutil.copytree(whole(name)[0], tmp_path / "run")
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert set(before) == {PLAN, PROGRESS, CHECKPOINT, *POLICIES}
-    train(make_plan(), folder)
+    left = {PLAN, PROGRESS, CHECKPOINT, RULES_FILE, CURVE, *POLICIES}
+    assert set(before) - {"tensorboard"} == left
+    train(make_plan(name), folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-@pytest.mark.parametrize("name", fast_and_slow(["ppo", "maskable-ppo"], ["ppo"]))
-def test_ppo_goes_on_from_its_last_checkpoint(name, tmp_path):
-    plan, before = make_plan(name), []
+@pytest.mark.parametrize("name", fast_and_slow(list(SMALL)[1:], ["ppo"]))
+def test_an_algorithm_goes_on_from_its_last_checkpoint(name, tmp_path):
+    # Weights stay what they were, where they are not lost.
+    still = {"learning_rate": 1e-12, "final_learning_rate": 1e-12}
+    changes = {"policy": "mlp"} if name == "ppo" else {}
+    plan, before = make_plan(make_algorithm(name, **still, **changes)), []
     with pytest.raises(StopError):
-        train(plan, tmp_path, watchers=(before.append, stop_at(3)))
+        train(plan, tmp_path, watchers=(before.append, stop_at(2)))
     kept = read_checkpoint(tmp_path)
-    assert (kept["update"], kept["rows"]) == (2, before[:2])
+    assert kept["rows"] == before[:2]
     after = []
     rows = train(plan, tmp_path, watchers=(after.append,))
-    assert [row["update"] for row in rows] == list(range(7))
     assert rows == after
-    assert rows[:2] == before[:2]
-    # The same policy, but in new episodes.
-    assert rows[2]["validation_drawn"] == before[2]["validation_drawn"]
-    assert rows[3]["value_loss"] != before[3]["value_loss"]
-    rates = [row["learning_rate"] for row in rows[3:]]
-    assert rates == pytest.approx([5e-4 - 4.5e-4 * update / 6 for update in (3, 4, 5, 6)])
+    assert without_time(rows[:2]) == without_time(before[:2])
+    assert [row["update"] for row in rows] == [0, 1, 2, 3]
+    assert [row["steps"] for row in rows] == [0, 80, 160, 240]
+    end = read_checkpoint(tmp_path)
+    for key, value in kept["parameters"]["policy"].items():
+        torch.testing.assert_close(end["parameters"]["policy"][key], value, rtol=0, atol=1e-6)
+    counts = [each["statistics"]["obs_rms"]["count"] for each in (kept, end)]
+    assert counts[1] - counts[0] >= 160
 
 
-@pytest.mark.parametrize(
-    ("name", "steps"), fast_and_slow([("ppo", 10), ("maskable-ppo", 20)], [("maskable-ppo", 20)])
-)
-def test_every_update_of_ppo_compares_replicas(name, steps, tmp_path, monkeypatch):
-    seen = []
-    monkeypatch.setattr(
-        "agents.training.ppo.recentre",
-        lambda advantages, replicas: seen.append((advantages.shape, replicas)),
-    )
-    train(make_plan(name), tmp_path)
-    assert seen == [((steps, 4), 2)] * 6
+def test_every_update_of_ppo_compares_replicas(tmp_path, monkeypatch):
+    sums = []
+
+    class Watched(ReplicaBaseline):
+        def _on_rollout_end(self):
+            super()._on_rollout_end()
+            sums.append(self.model.rollout_buffer.advantages.reshape(10, -1, 2).sum(axis=2))
+
+    monkeypatch.setattr("agents.training.learning.ReplicaBaseline", Watched)
+    train(make_plan("ppo"), tmp_path)
+    assert np.shape(sums) == (6, 10, 2)
+    np.testing.assert_allclose(sums, 0.0, atol=1e-5)
 
 
 # --- what a training leaves -----------------------------------------------------------------------
-
-
-def make_env(plan, **keywords):
-    return gym.make(SHORT, action=plan.algorithm.action, **{**KEYWORDS, **keywords})
 
 
 def test_the_curve_of_rounds(whole):
@@ -172,44 +181,90 @@ def test_the_curve_of_rounds(whole):
     assert all(0.01 < row["error"] < 1 for row in rows[1:])
 
 
-@pytest.mark.parametrize(
-    ("name", "actions"), fast_and_slow([("ppo", 1), ("maskable-ppo", 2)], [("maskable-ppo", 2)])
-)
-def test_the_curve_of_ppo_counts_seconds_whatever_the_encoding(name, actions, whole):
+@pytest.mark.parametrize(("name", "actions"), [("ppo", 1), ("maskable-ppo", 2)])
+def test_the_curve_counts_seconds_whatever_the_encoding(name, actions, whole):
     folder, rows = whole(name)
     assert make_plan(name).actions_per_step == actions
-    assert [row["steps"] for row in rows] == [40 * update for update in range(7)]
-    assert [row["update"] for row in rows if "validation" in row] == [0, 2, 4, 6]
-    assert all(0.05 < row["error"] < 0.5 for row in rows if "error" in row)
+    assert [row["steps"] for row in rows] == [0, 80, 160, 240]
     assert rows == read_progress(folder)
+    # A third and two thirds of the training are done at the updates before these rows.
+    rates = [row["learning_rate"] for row in rows[1:]]
+    first, last = (1e-3 if name == "ppo" else 5e-4), 5e-5
+    done = np.array([40, 120, 200]) / STEPS
+    assert rates == pytest.approx((first + (last - first) * done).tolist())
+    with Image.open(folder / CURVE) as image:
+        assert image.format == "PNG"
 
 
-@pytest.mark.parametrize("name", ["plackett-luce", "ppo"])
+def test_a_training_by_minutes_ends_in_time(tmp_path):
+    rows = train(make_plan("ppo", steps=None, minutes=0.05), tmp_path)
+    assert 3.0 <= rows[-1]["seconds"] < 30.0
+    assert rows[-1]["steps"] > 0
+
+
+@pytest.mark.parametrize(
+    "name", fast_and_slow(SMALL, ["plackett-luce", "ppo", "recurrent-ppo", "qr-dqn"])
+)
 def test_the_best_policy_is_the_best_in_validation(name, whole):
     folder, rows = whole(name)
     plan, seeds = make_plan(name), (1000, 1001)
-    errors = [row["validation"] for row in rows if "validation" in row]
-    env = make_env(plan, traffic_seeds=list(seeds))
-    for file, expected in ((BEST, min(errors)), (POLICY, errors[-1])):
+    errors = [min(row["validation"], row["validation_drawn"]) for row in rows]
+    (world,) = plan.worlds
+    given = {"action": plan.algorithm.action, "traffic_seeds": list(seeds)}
+    env = make_vector(world.env, 2, {**world.keywords, **given})
+    best = errors.index(min(errors))
+    for file, row in ((BEST, rows[best]), (POLICY, rows[-1])):
         policy = load_policy(folder / file, env)
-        played = evaluate(env, policy, seeds, TRAINING_VALIDATION.start)
-        assert -np.mean([row["reward"] for row in played]) == pytest.approx(expected, rel=1e-6)
-        assert policy.card["figures"]["validation"] == expected
+        column = {"deterministic": "validation", "drawn": "validation_drawn"}[policy.card["acts"]]
+        assert row[column] == min(row["validation"], row["validation_drawn"])
+        played = evaluate(env, policy, seeds, TRAINING_VALIDATION.start, deterministic=True)
+        error = -np.mean([row["reward"] for row in played])
+        assert error == pytest.approx(row["validation"], rel=1e-6)
+        assert policy.card["figures"]["validation"] == row["validation"]
+        assert policy.card["training"]["steps"] == row["steps"]
     training = load_policy(folder / BEST, env).card["training"]
-    assert (
-        training["steps"] == rows[errors.index(min(errors)) * (1 if actions(plan) else 2)]["steps"]
-    )
     assert (training["learner"], training["seed"]) == (name, 1)
     assert training["traffic seeds"] == "0..2"
 
 
-def actions(plan):
-    return plan.algorithm.name == "plackett-luce"
+def test_rules_are_played_once_on_the_same_traffic(whole, monkeypatch, tmp_path):
+    folder = shutil.copytree(whole()[0], tmp_path / "run")
+    kept = json.loads((folder / RULES_FILE).read_text())
+    assert list(kept) == list(RULES)
+    cell = Cell(SHORT, "speed-front", KEYWORDS, noise_seed=TRAINING_VALIDATION.start)
+    rewards = [row["reward"] for row in play(cell, (1000, 1001))]
+    assert kept["speed-front"] == pytest.approx(-np.mean(rewards))
+    monkeypatch.setattr("agents.training.run.RULES", ("none",))
+    run = Run(make_plan(), folder, None, (), silent)
+    assert run.rules == kept
+
+
+def test_ppo_begins_with_a_policy_by_another_algorithm(whole, tmp_path):
+    still = make_algorithm("ppo", learning_rate=1e-12, final_learning_rate=1e-12)
+    plan = make_plan(still, initial=str(whole()[0] / BEST))
+    plan.check()
+    first = train(plan, tmp_path)[0]
+    figures = read_tensors(whole()[0] / BEST)[0]["figures"]
+    assert first["validation"] == pytest.approx(figures["validation"], rel=1e-5)
+
+
+@pytest.mark.slow
+def test_ppo_learns_to_err_less_than_the_best_rule(tmp_path):
+    plan = make_plan(
+        parse_algorithm('ppo {"validations": 4}', 6),
+        envs=(f'{SHORT} {{"bandwidth": 1}}',),
+        traffic_seeds=tuple(range(32)),
+        validation_seeds=tuple(range(1000, 1016)),
+        steps=100_000,
+    )
+    rows = train(plan, tmp_path)
+    rules = json.loads((tmp_path / RULES_FILE).read_text())
+    assert rows[-1]["validation"] < 0.98 * min(rules.values())
 
 
 def test_a_validation_is_seeded_and_leaves_the_draws_of_the_training_alone(whole, tmp_path):
     plan = make_plan()
-    run = Run(plan, shutil.copytree(whole()[0], tmp_path / "run"), None, (), print)
+    run = Run(plan, shutil.copytree(whole()[0], tmp_path / "run"), None, (), silent)
     policies, state = plan.algorithm.make_policies(plan.worlds), torch.get_rng_state()
     row = run.validate(policies, 0)
     assert torch.equal(torch.get_rng_state(), state)
@@ -230,13 +285,13 @@ def test_several_environments_teach_one_network(whole):
         each = [row for name, row in rows[-1].items() if name.startswith(f"{column} in dptse_env")]
         assert len(each) == 2
         assert rows[-1][column] == pytest.approx(sum(each) / 2)
-    policy = load_policy(folder / POLICY, make_env(make_plan()))
+    policy = load_policy(folder / POLICY, gym.make(SHORT, action="slots", **KEYWORDS))
     assert policy.card["training"]["also"] == [WIDE]
-    env = make_env(make_plan(), bandwidth=3)
+    env = gym.make(SHORT, action="slots", bandwidth=3, **KEYWORDS)
     elsewhere = load_policy(folder / BEST, env, allow=("bandwidth",))
     assert env.action_space.contains(elsewhere.predict(env.reset(seed=0)[0])[0])
     one, two = (read_checkpoint(each)["policy"] for each in (folder, whole()[0]))
-    assert not any(torch.equal(one[key], two[key]) for key in one)
+    assert not any(torch.equal(one[key], two[key]) for key in one if key.startswith("scorer."))
 
 
 # --- folders that are refused ---------------------------------------------------------------------
@@ -249,7 +304,10 @@ def test_several_environments_teach_one_network(whole):
         ({"envs": (ENV.replace("80", "81"),)}, r"envs is \[.*80.*\] there and \[.*81.*\] now"),
         ({"traffic_seeds": (0, 1)}, r"traffic_seeds is \[0, 1, 2\] there and \[0, 1\] now"),
         ({"algorithm": make_algorithm(width=9)}, r"algorithm\.width is 8 there and 9 now"),
-        ({"algorithm": make_algorithm("ppo")}, "algorithm.name is 'plackett-luce' there and 'ppo'"),
+        (
+            {"algorithm": make_algorithm("ppo"), "steps": STEPS},
+            "algorithm.name is 'plackett-luce' there and 'ppo' now",
+        ),
     ],
 )
 def test_the_folder_of_another_plan_is_refused(changes, message, whole):
@@ -317,14 +375,19 @@ def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
 # --- non-interference; see `tests.test_non_interference` ------------------------------------------
 
 
-@pytest.fixture(scope="module", params=ALGORITHMS)
+@pytest.fixture(
+    scope="module", params=fast_and_slow(ALGORITHMS, ["ppo", "plackett-luce", "recurrent-ppo"])
+)
 def private(request, tmp_path_factory):
     """A policy of every algorithm, trained a little with the truth at hand."""
-    env = 'dptse_env:dptse/PrivateHighway-v1 {"horizon": 70, "privacy": "capped"}'
-    plan = make_plan(request.param, envs=(env,), traffic_seeds=(0, 1), validation_seeds=(1000,))
+    keywords = {"horizon": 70, "privacy": "capped", "bandwidth": 1 if "dqn" in request.param else 2}
+    plan = make_plan(
+        request.param, envs=(f"{PRIVATE} {json.dumps(keywords)}",), traffic_seeds=(0, 1),
+        validation_seeds=(1000,),
+    )  # fmt: skip
     folder = tmp_path_factory.mktemp(request.param)
     train(plan, folder)
-    return plan.algorithm.action, folder / POLICY
+    return {"action": plan.algorithm.action, "bandwidth": keywords["bandwidth"]}, folder / POLICY
 
 
 class Acting:
@@ -336,16 +399,20 @@ class Acting:
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         if state is None:
             torch.manual_seed(7)
-        return self.act(observation), True
+        action, state = self.act(observation, state and state[0])
+        return action, (state,)
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_traffic_does_not_show_through_a_trained_policy(private, deterministic):
-    action, path = private
-    env = blind(make_private(action=action))
+    keywords, path = private
+    env = blind(make_private(**keywords))
     policy = load_policy(path, env)
-    act = Acting(lambda observation: policy.predict(observation, deterministic=deterministic)[0])
-    assert not unlike(env, act)
+
+    def act(observation, state):
+        return policy.predict(observation, state, np.array([state is None]), deterministic)
+
+    assert not unlike(env, Acting(act))
 
 
 @pytest.mark.parametrize("action", ["slots", "sequential"])
@@ -353,9 +420,9 @@ def test_a_policy_that_sees_the_truth_would_show(action):
     env = blind(make_private(action=action))
     process, interface = env.unwrapped.process, env.unwrapped.interface
 
-    def crowded(observation):
+    def crowded(observation, state):
         density = process.truth(np.array([0]))[:, :15, 0]
         wanted = density.argsort(axis=1).argsort(axis=1) >= 15 - interface.bandwidth
-        return interface.actions.encode(wanted, process.pending.picked)[0]
+        return interface.actions.encode(wanted, process.pending.picked)[0], None
 
     assert unlike(env, Acting(crowded))
