@@ -124,7 +124,7 @@ def raw(road, name, observation):
     """The values of a channel before it is scaled; None where there are none."""
     (k,) = (k for k, channel in enumerate(road.channels) if channel.name == name)
     channel = road.channels[k]
-    shown = RoadFeatures(road, 1)(observation)[0, :, k].numpy() * channel.scale + channel.centre
+    shown = RoadFeatures(road, 1)(observation)[:, k, 0].numpy() * channel.scale + channel.centre
     return [x if at is not None else None for x, at in zip(shown, channel.source, strict=True)]
 
 
@@ -138,7 +138,7 @@ def test_mainline_blocks_stand_at_their_segments():
             found = raw(road, f"mainline {name}", observation)
             np.testing.assert_allclose(found, starts[name] + np.arange(n), rtol=1e-5)
         features = RoadFeatures(road, 2)
-        assert features(observation).shape == (1, n, features.n_inputs)
+        assert features(observation).shape == (n, features.n_inputs, 1)
 
 
 def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
@@ -219,7 +219,7 @@ def test_a_segment_with_a_fixed_sensor_is_queried_when_there_is_no_other():
 def test_neighbours_come_with_a_segment_and_its_place():
     road = make_policy().road
     observation = torch.rand(1, road.size)
-    inputs = RoadFeatures(road, 2)(observation)[0]
+    inputs = RoadFeatures(road, 2)(observation)[..., 0]
     own = inputs[:, : (inputs.shape[1] - 3) // 5]
     upstream, downstream = (
         inputs[:, own.shape[1] : 2 * own.shape[1]],
@@ -236,9 +236,9 @@ def test_neighbours_come_with_a_segment_and_its_place():
 @pytest.mark.parametrize(("n", "reach"), [(5, 1), (5, 2), (3, 4)])
 def test_windows_are_those_of_a_padded_road_and_so_is_their_gradient(n, reach):
     torch.manual_seed(0)
-    features = torch.randn(4, n, 3, requires_grad=True)
-    padded = torch.nn.functional.pad(features, (0, 0, reach, reach))
-    expected = torch.cat([padded[:, i : i + n] for i in range(2 * reach + 1)], dim=2)
+    features = torch.randn(n, 3, 4, requires_grad=True)
+    padded = torch.nn.functional.pad(features, (0, 0, 0, 0, reach, reach))
+    expected = torch.cat([padded[i : i + n] for i in range(2 * reach + 1)], dim=1)
     windows = Windows.apply(features, reach)
     torch.testing.assert_close(windows, expected, rtol=0, atol=0)
     weights = torch.randn_like(expected)
@@ -264,11 +264,9 @@ def test_neighbours_and_the_whole_road_count():
 def test_segments_share_one_scorer():
     """Away from its ends, scores shift with what the segments see."""
     policy = make_policy("short-highway")
-    near = torch.randn(1, 12, 32)
-    scorer = policy.scorer
-    inputs = torch.randn(1, 12, policy.features.n_inputs)
-    scores = scorer(inputs, near)
-    shifted = scorer(inputs.roll(1, dims=1), near.roll(1, dims=1))
+    inputs = torch.randn(12, policy.features.n_inputs, 1)
+    scores = policy.scorer(inputs)
+    shifted = policy.scorer(inputs.roll(1, dims=0))
     torch.testing.assert_close(shifted[:, 2:-1], scores[:, 1:-2])
 
 

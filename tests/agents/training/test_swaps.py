@@ -168,6 +168,11 @@ def policy():
     return RoadPolicy.from_config(config)
 
 
+def inputs_of(policy, observations):
+    """The inputs of the segments, shape (m, 6, n_inputs)."""
+    return policy.features(torch.from_numpy(observations)).permute(2, 0, 1).numpy()
+
+
 def planted(policy, gain=None, spent=None, n_states=300, trials=20):
     """Swaps whose gain is that of their segments, ``gain(inputs)`` of shape (m, 6), and noise."""
     generator = np.random.default_rng(0)
@@ -180,7 +185,7 @@ def planted(policy, gain=None, spent=None, n_states=300, trials=20):
     def difference(of):
         if of is None:
             return np.zeros(len(state))
-        values = of(policy.features(torch.from_numpy(seen)).numpy())
+        values = of(inputs_of(policy, seen))
         return values[state, added] - values[state, dropped]
 
     noise = generator.normal(0.0, 0.02, len(state))
@@ -210,7 +215,7 @@ def test_scores_move_by_a_step_of_the_expected_gain(policy):
         return 0.1 * np.tanh(inputs[:, :, 0])
 
     swaps = planted(policy, gain)
-    expected = centred(gain(policy.features(torch.from_numpy(swaps.observations)).numpy()))
+    expected = centred(gain(inputs_of(policy, swaps.observations)))
     assert expected.std() > 0.04
     assert (moved(policy, swaps) - expected).std() < 0.2 * expected.std()
 
@@ -220,7 +225,7 @@ def test_budgets_have_their_price(policy):
         return 8.0 * (inputs[:, :, 0] > 0.0)
 
     swaps = planted(policy, None, spent)
-    expected = -0.01 * centred(spent(policy.features(torch.from_numpy(swaps.observations)).numpy()))
+    expected = -0.01 * centred(spent(inputs_of(policy, swaps.observations)))
     change = moved(policy, swaps)
     assert np.corrcoef(change.ravel(), expected.ravel())[0, 1] > 0.85
     assert np.polyfit(expected.ravel(), change.ravel(), 1)[0] == pytest.approx(1.0, abs=0.3)
