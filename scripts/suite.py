@@ -2,7 +2,8 @@
 
 dptse suite speed-front --cells short
 
-Scores stand beside the best rule's, the mean only where all cells are played. What a folder has of an earlier run is not played again.
+Scores stand beside the best rule's; the mean is over all cells. What a folder has of an earlier
+run is not played again.
 """
 
 from __future__ import annotations
