@@ -46,7 +46,8 @@ def test_the_page_trains_compares_and_enters_the_suite(tmp_path, monkeypatch):
                 printed.write(done.stdout)
     assert replaced == {*LESS}
     assert re.search(r"% (below|above)", printed.getvalue())
-    assert all((tmp_path / "mine" / name).is_file() for name in ("curve.png", "test/space_time.png"))
+    pictures = ("mine/curve.png", "mine/test/space_time.png")
+    assert all((tmp_path / picture).is_file() for picture in pictures)
     card = json.loads(next(tmp_path.glob("results/my-suite/**/card.json")).read_text())
     assert card["scores"].keys() == {"short"}
     observation = names["envs"].reset(seed=0)[0]
