@@ -23,8 +23,8 @@ $(READY): pyproject.toml constraints.txt
 
 DEMO = --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}'
 
-demo: setup  ## Train a query policy with PPO for two minutes and evaluate it beside the rules on unseen traffic; results/demo.
-	$(BIN)/dptse train $(DEMO) --minutes 2 --algorithm 'ppo {"validations": 8}' \
+demo: setup  ## Train a query policy with PPO for a minute and evaluate it beside the rules on unseen traffic; results/demo.
+	$(BIN)/dptse train $(DEMO) --minutes 1 --algorithm 'ppo {"validations": 8}' \
 		--traffic 0:48 --validation 1000:1016 --output results/demo/training
 	$(BIN)/dptse evaluate $(DEMO) --policies results/demo/training/best.safetensors \
 		--seeds 2000:2032 --reference speed-front --output results/demo --force

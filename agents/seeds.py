@@ -21,7 +21,7 @@ TRAINING_VALIDATION = range(4_000_000, 5_000_000)
 STUDY_TEST = range(6_000_000, 7_000_000)
 """The test results of the study of policies."""
 SUITE = range(7_000_000, 8_000_000)
-"""The cells of query suites."""
+"""The cells of the query suite."""
 TRAINING = range(10_000_000, 1_010_000_000)
 """Training episodes; see `training_seed`."""
 

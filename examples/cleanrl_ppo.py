@@ -6,7 +6,8 @@ python examples/cleanrl_ppo.py --steps 300000
 ``gym.make_vec`` makes a batch of episodes that steps as one. Its autoreset is that of the same
 step: the step that ends an episode returns the first observation of the next one, and
 ``infos["final_obs"]`` has the last one of the old. Episodes end by truncation alone, so the value
-of that last observation stands for what would have followed.
+of that last observation stands for what would have followed. The encoding ``slots`` suits PPO:
+one categorical choice for each query.
 """
 
 import gymnasium as gym

@@ -51,33 +51,17 @@ def error(policy) -> float:
     return -1000 * np.mean([row["reward"] for row in dptse_env.evaluate(env, policy, HELD_OUT)])
 
 
-def one_thread(**_: Any) -> None:
-    """Keep an env runner to one core: the networks are small."""
-    torch.set_num_threads(1)
-
-
-def main(steps: int = 300_000, seed: int = 0, runners: int = 0) -> None:
-    """Train, and compare the policy with its untrained self and a rule on held-out traffic.
-
-    Args:
-        steps: Steps to train for, at least.
-        seed: Seeds the environments, the actions and the weights.
-        runners: Processes that collect episodes; with 0 the main process does.
-    """
-    keywords = {**KEYWORDS, "horizon": 120, "random_start": True, "threads": 1}
-    ray.init(
-        address="local", include_dashboard=False, log_to_driver=False,
-        runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
-    )  # fmt: skip
+def main(steps: int = 300_000, seed: int = 0) -> None:
+    """Train, and compare the policy with its untrained self and a rule on held-out traffic."""
+    ray.init(address="local", include_dashboard=False, log_to_driver=False)
     algorithm = (
         PPOConfig()
-        .environment(ENV, env_config=keywords)
+        .environment(ENV, env_config={**KEYWORDS, "horizon": 120, "random_start": True})
         .env_runners(
-            num_env_runners=runners,
+            num_env_runners=0,  # processes beside this one
             num_envs_per_env_runner=N_ENVS,
             gym_env_vectorize_mode="vector_entry_point",
         )
-        .callbacks(on_environment_created=one_thread)
         .rl_module(model_config=DefaultModelConfig(fcnet_hiddens=[64, 64]))
         .training(train_batch_size_per_learner=BATCH, minibatch_size=256, num_epochs=4)
         .training(lr=3e-4, gamma=0.9, entropy_coeff=0.003)

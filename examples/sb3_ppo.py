@@ -7,6 +7,7 @@ python examples/sb3_ppo.py --steps 3000000
 traffic and noise, so that `ReplicaBaseline` can compare their queries. `VecNormalize` scales
 observations by running statistics, without which a perceptron ends near the rule; they are saved
 with its weights in results/examples/sb3_ppo.safetensors, which ``dptse evaluate --policies`` plays.
+The encoding ``slots`` suits PPO: one categorical choice for each query.
 """
 
 from pathlib import Path

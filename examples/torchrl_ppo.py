@@ -4,8 +4,9 @@ pip install -e '.[train]' torchrl
 python examples/torchrl_ppo.py --steps 300000
 
 `GymWrapper` takes our vector environment where it is made with ``autoreset_mode="Disabled"``:
-TorchRL resets each episode itself when it has ended. All encodings work; here ``slots``, with one
-categorical choice for each query.
+TorchRL resets each episode itself when it has ended (it refuses ``NextStep``, and ``SameStep``
+fails in its reader of ``info``). All encodings work; ``slots`` suits PPO, with one categorical
+choice for each query.
 """
 
 import gymnasium as gym

@@ -26,7 +26,7 @@ GROUPS = {
         "tune": "Tune the estimators' settings on training traffic.",
     },
     "judge": {
-        "suite": "Score policies in the tasks of the query suite.",
+        "suite": "Score a policy in the cells of the query suite, and write its card.",
         "study": "Play a study, and report on its rows.",
         "audit": "Attack the privacy of an environment.",
         "replay-field": "Replay a measured field of density and speed with the estimators.",

@@ -303,7 +303,7 @@ def commands(args: Args, choice: Choice, folder: Path) -> list[tuple[str, str]]:
         ),
         (
             "Train a query policy, some minutes:",
-            f"dptse train {start} --algorithm 'ppo {{\"steps\": 300000}}' "
+            f"dptse train {start} --steps 300000 "
             f"--traffic {seeds['training']} --validation {seeds['validation']} --output {policy}",
         ),
         (

@@ -25,7 +25,6 @@ from agents.study import run as run_study
 from dptse_env.config import parse_seeds
 from dptse_env.utils.fields import require
 from scripts.cli import Machines
-from scripts.suite import suitable
 
 STUDIES = ("paper", "guarantees", "estimators", "roads", "policies", "suite")
 RESULTS = Path("results")
@@ -103,12 +102,35 @@ def find_study(args: Args) -> Study:
         print(f"{n} are of the given environments", file=sys.stderr)
     return dataclasses.replace(
         found,
-        cells=suitable(cells, "what was given") if given else tuple(cells),
+        cells=_suitable(cells) if given else tuple(cells),
         seeds=seeds[:most],
         follow=follow and (lambda rows, folder: changed(follow(rows, folder))),
         # Further tables are measured in the study's own environments.
         measures={} if given else found.measures,
     )
+
+
+def _suitable(cells: Sequence[Cell]) -> tuple[Cell, ...]:
+    """Return the cells that can be played, and say how many suit no given environment, and why.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: None can be played.
+    """
+    taken, refused = [], []
+    for cell in cells:
+        try:
+            cell.check()
+        except ValueError as problem:
+            refused.append(problem)
+        else:
+            taken.append(cell)
+    if not taken:
+        raise refused[0]
+    if refused:
+        n = f"{len(refused)} of {len(cells)} cells"
+        print(f"{n} do not suit what was given and are left out: {refused[0]}", file=sys.stderr)
+    return tuple(taken)
 
 
 def _own(name: str) -> Study:

@@ -1,9 +1,9 @@
-"""Score policies in the tasks of the query suite.
+"""Score a query policy in the cells of the query suite, and write its card.
 
-dptse suite --policies round-robin --tasks short
+dptse suite speed-front --cells short
 
-Scores stand beside those of the policies that come with the package. What a folder has of an
-earlier run is not played again.
+Scores stand beside the best rule's; the mean is over all cells. What a folder has of an earlier
+run is not played again.
 """
 
 from __future__ import annotations
@@ -13,99 +13,103 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import polars as pl
+import tyro
+
+import dptse_env
+from agents.files import write_json
 from agents.play import Cell
 from agents.policies import policy_name
-from agents.studies.suite import (
-    LEARNED,
-    NAME,
-    ONE,
-    RULES,
-    TASKS,
-    ZERO,
-    Scores,
-    Task,
-    beside_recorded,
-    entry,
-    format_scores,
-    make_cell,
-    score_all,
-)
-from agents.study import read_rows
-from agents.study import run as run_study
+from agents.studies import suite
+from agents.study import Study, play_study
 from agents.terminal import make_table, print_table
 from dptse_env.utils.fields import require, require_name
 from scripts.cli import Machines
 
+CARD = "card.json"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Args(Machines):
-    """Score policies in the tasks of the query suite."""
+    """Score a query policy in the cells of the query suite, and write its card."""
 
-    policies: tuple[str, ...] = ()
-    """Schedules; saved policies by file or shipped name; "module:Class"."""
-    tasks: tuple[str, ...] = ()
-    """Tasks by name; all of them if none is given."""
-    output: Path = Path("results/my-suite")
-    """Folder of rows, tables and a figure."""
+    policies: tyro.conf.Positional[tuple[str, ...]]
+    """Schedules; saved policies by file or shipped name; "module:Class". Where there are several,
+    the first that suits a cell acts in it."""
+    cells: tuple[str, ...] = ()
+    """Cells by name; all of them if none is given."""
+    beside: tuple[Path, ...] = ()
+    """Cards of other policies, to be shown beside it."""
+    output: Path | None = None
+    """Folder of the card and the rows; one below results/my-suite if not given."""
 
 
 def main(args: Args) -> None:
-    """Play the policies in the tasks that they suit, and report."""
-    named = {policy_name(source): source for source in args.policies}
-    require(bool(named), "policies", "one or more", args.policies)
-    require(len(named) == len(args.policies), "policies", "of different names", args.policies)
-    for name in args.tasks:
-        require_name("tasks", name, [task.name for task in TASKS])
-    tasks = [task for task in TASKS if not args.tasks or task.name in args.tasks]
-    cells = [
-        cell
-        for name, source in named.items()
-        for cell in suitable([make_cell(task, name, source) for task in tasks], source)
-    ]
-    study = entry(cells, tasks)
-    run_study(study, args.place(args.output))
-    rows = beside_recorded(read_rows(study.name, args.output), study.cells)
-    print_scores(score_all(rows, tasks), list(named), tasks)
-    print(f"tables and the figure are in {args.output}/")
+    """Play what was entered, write its card, and print scores."""
+    require(bool(args.policies), "policies", "one or more", args.policies)
+    others = [suite.read_card(path) for path in args.beside]
+    recorded = suite.recorded_rows()
+    for name in args.cells:
+        require_name("cells", name, list(suite.CELLS))
+    cells = enter(args.policies, args.cells or tuple(suite.CELLS))
+    (entry,) = {each.labels["policy"] for each in cells}
+    # A schedule by "module:Class" has a character that not every system allows in a path.
+    folder = args.output or Path("results/my-suite") / entry.replace(":", "-")
+    study = Study("suite", cells, suite.SEEDS, lambda rows, folder: "")
+    played = play_study(study, args.place(folder))
+    # The folder may have rows of other policies, of an earlier state of this one's file, and of
+    # this one under another name.
+    present = pl.col("cell").is_in([each.id for each in cells])
+    own = played.filter(present, version=dptse_env.__version__).with_columns(policy=pl.lit(entry))
+    rows: pl.DataFrame = pl.concat([recorded, *others, own], how="diagonal_relaxed")
+    rows = rows.unique(("version", "policy", "name", "traffic_seed"), keep="last")
+    write_json(folder / CARD, suite.make_card(rows, entry, cells))
+    print_scores(rows, [entry, *(each["policy"][0] for each in others)])
+    print(f"the card is {folder / CARD}")
 
 
-def suitable(cells: Sequence[Cell], what: str) -> tuple[Cell, ...]:
-    """Return the cells that can be played, and say how many do not suit what was given, and why.
+def enter(policies: Sequence[str], names: Sequence[str]) -> tuple[Cell, ...]:
+    """Return cells with the first policy that suits each, and say which are left out, and why.
 
     Raises:
         FileNotFoundError: There is no such policy.
-        ValueError: None can be played.
+        ValueError: One of the policies acts in no cell.
     """
-    taken, refused = [], []
-    for cell in cells:
-        try:
-            cell.check()
-        except ValueError as problem:
-            refused.append(problem)
-        else:
-            taken.append(cell)
-    if not taken:
-        raise refused[0]
-    if refused:
-        n = f"{len(refused)} of {len(cells)} cells"
-        print(f"{n} do not suit {what} and are left out: {refused[0]}", file=sys.stderr)
-    return tuple(taken)
+    entry = "+".join(map(policy_name, policies))
+    reasons = dict.fromkeys(policies, "those before it act in all cells")
+    found, left_out = {}, {}
+    for name in names:
+        for source in policies:
+            cell = suite.make_cell(name, entry, source)
+            try:
+                cell.check()
+            except ValueError as problem:
+                left_out[name] = reasons[source] = str(problem)
+            else:
+                found[name] = cell
+                break
+    acting = {cell.policy for cell in found.values()}
+    idle = [source for source in policies if source not in acting]
+    if idle:
+        raise ValueError(f"{idle[0]!r} acts in no cell: {reasons[idle[0]]}")
+    missing = [name for name in names if name not in found]
+    if missing:
+        which = ", ".join(missing)
+        print(f"{entry} does not suit {which}: {left_out[missing[0]]}", file=sys.stderr)
+    return tuple(found.values())
 
 
-def print_scores(scores: Scores, names: Sequence[str], tasks: Sequence[Task]) -> None:
-    """Print the scores of policies by task, beside the best of those that come with the package."""
-    others = [name for name in (*RULES, *LEARNED) if name not in (*names, ZERO, ONE)]
-
-    def best(task: str) -> str:
-        known = {name: scores[name][task] for name in others if task in scores.get(name, {})}
-        if not known:
-            return "-"
-        name = max(known, key=lambda name: known[name].mean)
-        return f"{name} {known[name].mean:.2f} ± {known[name].half_width:.2f}"
-
-    titles = [task.name for task in tasks]
-    table = make_table(f"{NAME}: scores", "task", *names, "best that comes with it")
-    columns = [format_scores(scores[name], tasks) for name in names]
-    for line in zip(["mean", *titles], *columns, ["", *map(best, titles)], strict=True):
+def print_scores(rows: pl.DataFrame, policies: Sequence[str]) -> None:
+    """Print scores by cell, those of the best rule beside them, and what the oracle gains."""
+    scores = suite.score_all(rows)
+    columns = {policy: suite.format_scores(each) for policy, each in scores.items()}
+    best = [next(policy for policy in scores if policy in suite.RULES)]
+    best += [suite.best_rule(rows, name) for name in suite.CELLS]
+    rules = [f"{rule} {columns[rule][place]}" for place, rule in enumerate(best)]
+    rooms = ["", *(f"{suite.room(rows, name).mean:.1f} %" for name in suite.CELLS)]
+    title = f"{suite.NAME}: {suite.ZERO} has 0, {suite.ONE} has 1"
+    table = make_table(title, "cell", *policies, "best rule", f"{suite.ONE} below it")
+    shown = [columns[policy] for policy in policies]
+    for line in zip(["mean", *suite.CELLS], *shown, rules, rooms, strict=True):
         table.add_row(*line)
     print_table(table)

@@ -19,14 +19,14 @@ from agents.seeds import CHOICE, EVALUATION, TUNING
 from agents.statistics import mean_interval
 from agents.study import Place, Study, play_study
 from agents.tables import ERROR, values
-from dptse_env.estimators import ESTIMATORS
 
 NAME = "fit"
 FILTER, ROUND_ROBIN = "ekf", "round-robin"
 """Estimator and query rule with which parameters are chosen."""
 
-TRIED = ("asm", "blend", "ekf", "enkf", "mixture", "random_walk", "recurrent", "ukf")
-ESTIMATORS_TRIED = tuple(name for name in TRIED if name in ESTIMATORS)
+ESTIMATORS_TRIED = (
+    "asm", "blend", "ekf", "enkf", "mixture", "random_walk", "recurrent", "ukf",
+)  # fmt: skip
 """Estimators among which a fit chooses: all that take less than a millisecond a second."""
 
 RULES_TRIED = (

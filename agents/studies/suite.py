@@ -1,346 +1,488 @@
-"""The query suite: fourteen tasks with fixed traffic and noise, on which any policy is scored.
+"""The query suite: cells with fixed traffic and noise, in which any query policy is scored.
 
-In each task the paper's schedule has the score 0 and the error oracle 1. The rows of the policies
-that come with the package are in ``results/suite``; those of another one are put beside them.
+A score is the share of the way from the round robin (0) to the gain oracle (1). The rows of the
+rules and policies that come with the package are in ``results/suite``; a policy of one's own is
+scored against them, and gets a card.
+
+dptse study suite
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
 from scipy import stats
 
 import dptse_env
-from agents.environments import OTHER_DRIVERS, make_config, quietly
+from agents.environments import make_config, quietly
 from agents.figures import GREY, finish_figure, make_figure, save_figure
 from agents.play import Cell
+from agents.policies import find_policy, policy_name
 from agents.seeds import SUITE
 from agents.statistics import Interval
 from agents.study import ROWS, Study, read_table
 from agents.tables import (
-    DENSITY,
     ERROR,
-    SPEED,
     Labels,
     UnmeasuredError,
+    below,
+    cell,
     format_range,
+    grid,
     markdown,
-    pick,
+    mean,
     pick_paired,
+    tenths,
     values_of,
 )
 from dptse_env.config import parse_seeds
 from dptse_env.parts import privacy_report
+from dptse_env.policies import shipped_policies
+from dptse_env.utils.fields import number, parse_json, require
 
 NAME = "query-suite-v3"
 """Changes with anything that a score depends on."""
 
-PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
-LONG, SHORT = "dptse_env:dptse/LongHighway-v0", "dptse_env:dptse/ShortHighway-v0"
-ZERO, ONE = "paper", "oracle-error"
+ZERO, ONE = "round-robin", "oracle-gain"
 """Schedules of the scores 0 and 1."""
-
-ROAD_SEEDS, LONG_SEEDS = parse_seeds("2500:2548"), parse_seeds("2500:2516")
-"""Test traffic of no other study: of roads of up to 15 segments, and of the long road."""
 
 RECORDED = Path(__file__).parents[2] / "results" / "suite"
 """Folder of the rows that come with the package."""
 FIGURE = "scores.png"
 
+# Cells.
 
-@dataclass(frozen=True)
-class Task:
-    """An environment in which policies are scored.
+PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
+LONG, SHORT = "dptse_env:dptse/LongHighway-v0", "dptse_env:dptse/ShortHighway-v0"
+SEEDS, LONG_SEEDS = parse_seeds("2500:2532"), parse_seeds("2500:2508")
+"""Test traffic of no other study: of roads of up to 15 segments, and of the long road."""
 
-    Attributes:
-        name: Name in tables.
-        meaning: The road, the release model, the estimator and the bandwidth.
-        env: Environment id.
-        keywords: Keywords of the environment but for the action encoding, which is the policy's.
-        seeds: Traffic seeds.
-    """
-
-    name: str
-    meaning: str
-    env: str
-    keywords: Mapping[str, Any] = field(hash=False)
-    seeds: tuple[int, ...] = ROAD_SEEDS
-
-    @cached_property
-    def guarantee(self) -> str:
-        """The guarantee for a trip, as mu and (epsilon, delta), or that there is none."""
-        with quietly():
-            report = privacy_report(make_config(self.env, self.keywords))
-        pair = f"μ = {report.mu:.2f}, ({report.epsilon:.4g}, {report.claimed_delta:g})"
-        return f"none: {pair}" if report.void_reasons else pair
-
-
-def _task(name: str, meaning: str, env: str, estimator: str, bandwidth: int, **more: Any) -> Task:
-    keywords = {"estimator": estimator, "bandwidth": bandwidth, **more}
-    return Task(name, meaning, env, keywords, LONG_SEEDS if env == LONG else ROAD_SEEDS)
-
-
-TASKS = (
-    _task("paper", "PaperHighway-v0, noise as printed, EKF, B = 5", PAPER, "ekf", 5),
-    _task(
-        "capped-ekf-5", "PrivateHighway-v1, capped, EKF, B = 5", PRIVATE, "ekf", 5,
-        privacy="capped",
-    ),
-    _task(
-        "capped-recurrent-5", "PrivateHighway-v1, capped, recurrent, B = 5", PRIVATE,
-        "recurrent", 5, privacy="capped",
-    ),
-    _task("paced-ekf-2", "PrivateHighway-v1, EKF, B = 2", PRIVATE, "ekf", 2),
-    _task("paced-recurrent-2", "PrivateHighway-v1, recurrent, B = 2", PRIVATE, "recurrent", 2),
-    _task("paced-recurrent-5", "PrivateHighway-v1, recurrent, B = 5", PRIVATE, "recurrent", 5),
-    _task(
-        "strict-recurrent-2", "paced-recurrent-2 with a delta of 1e-06", PRIVATE, "recurrent", 2,
-        delta=1e-6,
-    ),
-    _task(
-        "other-drivers", "paced-recurrent-2 with drivers by Krauss and two peaks of demand",
-        PRIVATE, "recurrent", 2, **OTHER_DRIVERS,
-    ),
-    _task(
-        "short", "ShortHighway-v0, paced, recurrent, B = 1", SHORT, "recurrent", 1,
-        privacy={"preset": "paced", "epsilon": 5.0}, parameters="w99-3lane",
-    ),
-    _task(
-        "long-capped-recurrent-8", "LongHighway-v0, capped, recurrent, B = 8", LONG,
-        "recurrent", 8, privacy={"preset": "capped", "epsilon": 5.0, "cap": 64},
-    ),
-    _task("long-recurrent-8", "LongHighway-v0, recurrent, B = 8", LONG, "recurrent", 8),
-    _task("long-ekf-4", "LongHighway-v0, EKF, B = 4", LONG, "ekf", 4),
-    _task("long-recurrent-2", "LongHighway-v0, recurrent, B = 2", LONG, "recurrent", 2),
-    _task(
-        "connected-recurrent-5",
-        "paced-recurrent-5 with one vehicle in ten connected, and detectors on segments 3, 7, 11",
-        PRIVATE, "recurrent", 5, penetration=0.1, corridor={"fixed_sensors": [3, 7, 11]},
-    ),
-)  # fmt: skip
-
-RULES = (
-    ZERO, "static", "round-robin", "random", "oldest-first", "largest-variance", "stale-variance",
-    "largest-deviation", "expected-reduction", "speed-front", ONE,
-)  # fmt: skip
-_CAPPED = ("capped-ekf-5", "capped-recurrent-5", "long-capped-recurrent-8")
-LEARNED = {
-    "private-highway": _CAPPED,
-    "capped-roads": _CAPPED,
-    "paced-roads": (
-        "paced-ekf-2", "paced-recurrent-2", "paced-recurrent-5", "strict-recurrent-2",
-        "other-drivers", "short", "long-recurrent-8", "long-ekf-4", "long-recurrent-2",
-    ),
-}  # fmt: skip
-"""Policies that come with the package, and the tasks with the observations that they know."""
+_EKF: Mapping[str, Any] = {"estimator": "ekf"}
+# A single network by its name is part of what a cell is, so that rows of other weights are others.
+_NETWORK: Mapping[str, Any] = {
+    "estimator": "recurrent",
+    "estimator_settings": {"recurrent": {"weights": "highway-flows"}},
+}
+_SHORT_PACED: Mapping[str, Any] = {
+    "privacy": {"preset": "paced", "epsilon": 5.0},
+    "parameters": "w99-3lane",
+}
+_ELSEWHERE: Mapping[str, Any] = {
+    "corridor": {
+        "lanes": (4,) * 9 + (3,) * 6,
+        "average_dwell": 6.8,
+        "demand": {
+            "base": {
+                "mainline": [[0.0, 2700.0], [200.0, 7400.0], [400.0, 2700.0]],
+                "on_ramps": [320.0, 300.0],
+            }
+        },
+        "incident": None,
+        "drivers": {"model": "IDM", "headway": 1.4, "speed_deviation": 0.1},
+    }
+}
+"""A road whose fourth lane ends, with drivers by IDM and without incidents."""
 
 
-def make_cell(task: Task, name: str, policy: str) -> Cell:
-    """Return the cell of a policy in a task.
-
-    Args:
-        task: The task.
-        name: Name of the policy in tables.
-        policy: What `agents.policies.find_policy` takes.
-    """
+def _cell(
+    env: str, bandwidth: int, *keywords: Mapping[str, Any], seeds: tuple[int, ...] = SEEDS
+) -> Cell:
+    every = {name: value for each in keywords for name, value in each.items()}
     return Cell(
-        env=task.env,
-        policy=policy,
-        keywords=task.keywords,
-        labels={"task": task.name, "policy": name},
+        env=env,
+        keywords={"bandwidth": bandwidth, **every},
         noise_seed=SUITE.start,
         transferred=True,
-        watchers=("summary",),
-        seeds=task.seeds,
+        seeds=seeds,
     )
 
 
-def entry(cells: Sequence[Cell], tasks: Sequence[Task] = TASKS) -> Study:
-    """Return a study of some policies, whose report has them beside those that are recorded.
+CELLS = {
+    "short": _cell(SHORT, 1, _EKF),
+    "short-paced": _cell(SHORT, 1, _NETWORK, _SHORT_PACED),
+    "paper": _cell(PAPER, 5, _EKF),
+    "capped": _cell(PRIVATE, 5, _EKF, {"privacy": "capped"}),
+    "paced": _cell(PRIVATE, 1, _EKF),
+    "paced-recurrent": _cell(PRIVATE, 1, _NETWORK),
+    "strict": _cell(PRIVATE, 2, _EKF, {"delta": 1e-6}),
+    "connected": _cell(PAPER, 2, _EKF, {"penetration": 0.1}),
+    "elsewhere": _cell(PRIVATE, 1, _EKF, _ELSEWHERE),
+    "long": _cell(LONG, 2, _EKF, seeds=LONG_SEEDS),
+}
+"""Environments with their traffic seeds, by name; the policy is another one each time."""
 
-    Scores need both references of the same version: where none is recorded, they are played, too.
+RULES = (
+    "paper", "static", "random", "oldest-first", "largest-variance", "stale-variance",
+    "largest-deviation", "expected-reduction", "speed-front", ZERO,
+)  # fmt: skip
+"""Schedules that do without the truth."""
+ORACLES = ("oracle-error", ONE)
+
+
+def make_cell(name: str, policy: str, source: str) -> Cell:
+    """Return a cell of `CELLS` with a policy.
 
     Args:
-        cells: Cells of the policies, see `make_cell`.
-        tasks: Tasks in the order of the tables.
+        name: Name of the cell.
+        policy: Name of the policy in tables.
+        source: What `agents.policies.find_policy` takes.
     """
-    recorded = read_table(RECORDED / ROWS).filter(pl.col("version") == dptse_env.__version__)
-    present = set(recorded.select("policy", "task").iter_rows())
-    played = {each.labels["task"] for each in cells}
-    references = [
-        make_cell(task, name, name)
-        for task in tasks
-        for name in (ZERO, ONE)
-        if task.name in played and (name, task.name) not in present
-    ]
-    wanted = (*cells, *references)
-    return Study(
-        "suite",
-        wanted,
-        ROAD_SEEDS,
-        lambda rows, folder: report(beside_recorded(rows, wanted), folder, tasks),
+    return replace(CELLS[name], policy=source, labels={"name": name, "policy": policy})
+
+
+def rule_cells() -> tuple[Cell, ...]:
+    """Return all cells with all schedules."""
+    return tuple(make_cell(name, each, each) for name, each in product(CELLS, (*RULES, *ORACLES)))
+
+
+def learned_cells() -> list[Cell]:
+    """Return all cells with all policies that come with the package, whether they fit or not."""
+    return [make_cell(name, each, each) for name, each in product(CELLS, shipped_policies())]
+
+
+def _fits(learned: Cell) -> bool:
+    try:
+        learned.check()
+    except ValueError:  # what a policy says that does not act on this road or with this privacy
+        return False
+    return True
+
+
+def recorded_rows() -> pl.DataFrame:
+    """Return the rows that come with the package, as far as they are of this state of it.
+
+    Raises:
+        ValueError: A reference was not played by this version, or with other weights of the
+            network.
+    """
+    rows = _present(read_table(RECORDED / ROWS)).filter(version=dptse_env.__version__)
+    there = set(rows.select("policy", "name").iter_rows())
+    for reference, name in product((ZERO, ONE), CELLS):
+        if (reference, name) not in there:
+            raise ValueError(
+                f"{RECORDED / ROWS} has no {reference} in the cell {name!r} by dptse-env "
+                f"{dptse_env.__version__}, so nothing can be scored; 'dptse study suite' in a "
+                "checkout plays what is missing"
+            )
+    return rows
+
+
+def _present(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows without those of networks and policies that came with the package before."""
+    return rows.filter(
+        pl.col("cell").is_in([each.id for each in (*rule_cells(), *learned_cells())])
     )
 
 
-def beside_recorded(rows: pl.DataFrame, cells: Sequence[Cell]) -> pl.DataFrame:
-    """Return the rows of some cells, and those that come with the package.
+# Scores.
 
-    A folder may have rows of an earlier state of the same file, which is another cell.
+
+class Score(NamedTuple):
+    """The score of a policy in a cell.
+
+    Attributes:
+        value: The share of the way from the round robin to the gain oracle.
+        parts: What each traffic seed adds to it beyond its expectation, to first order. Their sum
+            is 0, and the root of the sum of their squares is the standard error.
     """
-    own = rows.filter(pl.col("cell").is_in([each.id for each in cells]))
-    both: pl.DataFrame = pl.concat([read_table(RECORDED / ROWS), own], how="diagonal_relaxed")
-    return both.unique(("version", "cell", "traffic_seed"), keep="last", maintain_order=True)
+
+    value: float
+    parts: Mapping[int, float]
 
 
-def report(rows: pl.DataFrame, folder: Path, tasks: Sequence[Task] = TASKS) -> str:
-    """Return the tables, and draw the scores."""
-    scores = score_all(rows, tasks)
-    draw_scores(scores, tasks, folder / FIGURE)
-    parts = [f"# {NAME}", "## Scores", _score_table(scores, tasks)]
-    parts += ["## Tasks", _task_table(tasks)]
-    for task in tasks:
-        parts += [f"## `{task.name}`", _policy_table(rows, task)]
-    return "\n\n".join(parts)
+def score(rows: pl.DataFrame, policy: str, name: str) -> Score:
+    """Return the score of a policy in a cell.
 
-
-def score(rows: pl.DataFrame, policy: str, task: str) -> Interval:
-    """Return a normalised score with its 95 % interval over traffic seeds, paired.
-
-    With mean errors E, it is (E_zero - E) / (E_zero - E_one), above 1 for a policy that is better
-    than the oracle. The interval is that of a ratio of means of paired values, by linearisation.
+    With mean errors E over traffic seeds it is (E_zero - E) / (E_zero - E_one), below 0 for a
+    policy that is worse than the round robin. Its error is that of a ratio of means of paired
+    values, by linearisation.
 
     Raises:
         UnmeasuredError: No version has played the policy and both references, or the oracle is no
-            better than the paper's schedule, so that there is no scale.
+            better than the round robin, so that there is no scale.
     """
-    paired = pick_paired(rows, *(_labels(name, task) for name in (ZERO, policy, ONE)))
-    base, reached, best = (values_of(each, ERROR) for each in paired)
-    if base.mean() <= best.mean():
-        raise UnmeasuredError(policy, task)
-    span = float((base - best).mean())
-    value = float((base - reached).mean()) / span
-    residual = (base - reached) - value * (base - best)
-    half = float(stats.t.ppf(0.975, len(base) - 1)) * float(stats.sem(residual)) / span
-    return Interval(value, value - half, value + half, len(base))
+    labels = ({"policy": each, "name": name} for each in (ZERO, policy, ONE))
+    paired = pick_paired(rows, *labels)
+    start, reached, end = (values_of(each, ERROR) for each in paired)
+    n, span = len(start), float((start - end).mean())
+    if span <= 0.0:
+        raise UnmeasuredError(policy, name)
+    value = float((start - reached).mean()) / span
+    parts = ((start - reached) - value * (start - end)) / (span * math.sqrt(n * (n - 1)))
+    return Score(value, dict(zip(paired[0]["traffic_seed"], parts.tolist(), strict=True)))
 
 
-def _labels(policy: str, task: str) -> Labels:
-    return {"policy": policy, "task": task}
+def mean_score(scores: Sequence[Score]) -> Interval:
+    """Return the mean of scores with its 95 % interval; of one, that score with its own.
+
+    Cells share traffic seeds, whose parts may be alike; they are summed by seed before they are
+    squared. Degrees of freedom are those of the cell with the fewest seeds.
+    """
+    value = float(np.mean([each.value for each in scores]))
+    by_seed: dict[int, float] = {}
+    for each in scores:
+        for seed, part in each.parts.items():
+            by_seed[seed] = by_seed.get(seed, 0.0) + part / len(scores)
+    fewest = min(len(each.parts) for each in scores)
+    error = math.sqrt(sum(part**2 for part in by_seed.values()))
+    half = float(stats.t.ppf(0.975, fewest - 1)) * error
+    return Interval(value, value - half, value + half, len(by_seed))
 
 
-Scores = dict[str, dict[str, Interval]]
-"""Scores by policy and task."""
+Scores = dict[str, dict[str, Score]]
+"""Scores by policy and cell."""
 
 
-def score_all(rows: pl.DataFrame, tasks: Sequence[Task] = TASKS) -> Scores:
+def score_all(rows: pl.DataFrame) -> Scores:
     """Return the scores of all policies in some rows, the best mean first.
 
-    What was not measured is left out, and who has no mean comes last.
+    What was not measured is left out, and who was not played in all cells comes last.
     """
     found: Scores = {policy: {} for policy in rows["policy"].unique().sort()}
-    for policy, task in product(found, tasks):
+    for policy, name in product(found, CELLS):
         try:
-            found[policy][task.name] = score(rows, policy, task.name)
+            found[policy][name] = score(rows, policy, name)
         except UnmeasuredError:
             continue
 
-    def place(policy: str) -> float:
-        mean = mean_score(found[policy], tasks)
-        return np.inf if mean is None else -mean
+    def place(policy: str) -> tuple[bool, float]:
+        scores = list(found[policy].values())
+        return len(scores) < len(CELLS), -mean_score(scores).mean if scores else 0.0
 
     return {policy: found[policy] for policy in sorted(found, key=place)}
 
 
-def mean_score(by_task: Mapping[str, Interval], tasks: Sequence[Task] = TASKS) -> float | None:
-    """Return the mean of a policy's scores over all tasks; None where one is missing."""
-    if len(by_task) < len(tasks):
-        return None
-    return float(np.mean([each.mean for each in by_task.values()]))
+def format_scores(scores: Mapping[str, Score]) -> list[str]:
+    """Return a policy's mean, a dash where a cell is missing, and its scores by cell."""
+    in_order = [scores.get(name) for name in CELLS]
+    present = [each for each in in_order if each is not None]
+    found = [mean_score(present) if len(present) == len(CELLS) else None]
+    found += [None if each is None else mean_score([each]) for each in in_order]
+    return ["-" if each is None else f"{each.mean:.2f} ± {each.half_width:.2f}" for each in found]
 
 
-def format_scores(by_task: Mapping[str, Interval], tasks: Sequence[Task]) -> list[str]:
-    """Return a policy's mean and its scores with half of their intervals, dashes for none."""
-    mean, found = mean_score(by_task, tasks), [by_task.get(task.name) for task in tasks]
-    return [
-        "-" if mean is None else f"{mean:.2f}",
-        *("-" if each is None else f"{each.mean:.2f} ± {each.half_width:.2f}" for each in found),
+def best_rule(rows: pl.DataFrame, name: str) -> str:
+    """Return the rule of least error in a cell.
+
+    Raises:
+        UnmeasuredError: None was played.
+    """
+    there = set(rows.filter(name=name)["policy"])
+    played = [rule for rule in RULES if rule in there]
+    if not played:
+        raise UnmeasuredError(name)
+    return min(played, key=lambda rule: mean(rows, _labels(rule, name), ERROR).mean)
+
+
+def room(rows: pl.DataFrame, name: str) -> Interval:
+    """Return by how much the gain oracle lies below the best rule in a cell [%], paired.
+
+    Raises:
+        UnmeasuredError: One of them was not played.
+    """
+    return below(rows, _labels(ONE, name), _labels(best_rule(rows, name), name))
+
+
+def _labels(policy: str, name: str) -> Labels:
+    return {"policy": policy, "name": name}
+
+
+# Cards.
+
+
+def comparable() -> dict[str, str]:
+    """Return what cards must have in common to be compared: suite, package, and all cells."""
+    content = [[name, each.id, each.seeds] for name, each in CELLS.items()]
+    digest = hashlib.sha256(json.dumps(content).encode()).hexdigest()
+    return {"suite": NAME, "package": dptse_env.__version__, "cells": digest}
+
+
+def make_card(rows: pl.DataFrame, policy: str, cells: Sequence[Cell]) -> dict[str, Any]:
+    """Return the card of a policy.
+
+    Args:
+        rows: Rows of the policy and of both references.
+        policy: Its name in tables.
+        cells: What was played, see `make_cell`.
+    """
+    scores = score_all(rows)[policy]
+    everywhere = len(scores) == len(CELLS)
+    played = {
+        str(each.labels["name"]): {
+            "name": policy_name(each.policy),
+            "identity": find_policy(each.policy).identity,
+        }
+        for each in cells
+    }
+    return {
+        **comparable(),
+        "policy": policy,
+        "policies": played,
+        "score": _plain(mean_score(list(scores.values()))) if everywhere else None,
+        "scores": {name: _plain(mean_score([each])) for name, each in scores.items()},
+        "errors": {
+            name: {str(seed): -1000.0 * reward for seed, reward in _rewards(rows, policy, name)}
+            for name in scores
+        },
+    }
+
+
+def _rewards(rows: pl.DataFrame, policy: str, name: str) -> list[tuple[int, float]]:
+    own = rows.filter(policy=policy, name=name).sort("traffic_seed")
+    return list(own.select("traffic_seed", "reward").iter_rows())
+
+
+def _plain(interval: Interval) -> dict[str, float]:
+    return {"mean": interval.mean, "low": interval.low, "high": interval.high}
+
+
+def read_card(path: Path) -> pl.DataFrame:
+    """Return the errors of a card as rows of a policy, which has the file in its name.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no card, or cannot be compared with one of this suite and package.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is not there")
+    card = parse_json(path.read_text(encoding="utf-8"), str(path))
+    if not isinstance(card, dict) or not {*comparable(), "policy", "errors"} <= card.keys():
+        raise ValueError(f"{path} must be a card that 'dptse suite' wrote")
+    for key, own in comparable().items():
+        if card[key] != own:
+            raise ValueError(
+                f"{path} cannot be compared: its {key} is {card[key]!r:.80}, here it is {own!r}"
+            )
+    policy, errors, rows = f"{card['policy']} ({path})", card["errors"], []
+    require(isinstance(errors, dict) and bool(errors), f"{path}: errors", "by cell", errors)
+    for name, by_seed in errors.items():
+        seeds = [str(seed) for seed in CELLS[name].seeds or ()] if name in CELLS else []
+        allowed = "numbers of all traffic seeds of a cell"
+        fits = isinstance(by_seed, dict) and seeds and sorted(by_seed) == sorted(seeds)
+        require(bool(fits), f"{path}: errors[{name!r}]", allowed, by_seed)
+        for seed in seeds:
+            error = number(float, by_seed[seed], f"{path}: errors[{name!r}][{seed!r}]", None)
+            labels = _labels(policy, name)
+            rows.append({**labels, "traffic_seed": int(seed), "reward": -error / 1000.0})
+    return pl.DataFrame(rows).with_columns(version=pl.lit(dptse_env.__version__))
+
+
+# The report on all that comes with the package.
+
+
+def report(rows: pl.DataFrame, folder: Path) -> str:
+    """Return the tables, and draw the scores."""
+    rows = _present(rows)
+    scores = score_all(rows)
+    draw_scores(scores, folder / FIGURE)
+    header = ["policy", "mean", *(f"`{name}`" for name in CELLS)]
+    lines = [[f"`{policy}`", *format_scores(each)] for policy, each in scores.items()]
+    return "\n\n".join(
+        [
+            f"# {NAME}",
+            "## Scores",
+            markdown(header, lines),
+            "## What is to be won",
+            _room_table(rows),
+            "## Errors x 1000",
+            grid(
+                "policy",
+                list(scores),
+                list(CELLS),
+                lambda policy, name: f"{mean(rows, _labels(policy, name), ERROR).mean:.1f}",
+            ),
+            "## Cells",
+            _cell_table(),
+        ]
+    )
+
+
+def _room_table(rows: pl.DataFrame) -> str:
+    def error(policy: str, name: str) -> str:
+        return f"{mean(rows, _labels(policy, name), ERROR).mean:.1f}"
+
+    def best(name: str) -> str:
+        rule = best_rule(rows, name)
+        return f"{error(rule, name)} `{rule}`"
+
+    header = ["cell", ZERO, "best rule", ONE, "gain oracle below the best rule [%]"]
+    lines = [
+        [
+            f"`{name}`",
+            cell(error, ZERO, name),
+            cell(best, name),
+            cell(error, ONE, name),
+            cell(lambda name: tenths(room(rows, name)), name),
+        ]
+        for name in CELLS
     ]
+    return markdown(header, lines)
 
 
-def _score_table(scores: Scores, tasks: Sequence[Task]) -> str:
-    lines = [[f"`{policy}`", *format_scores(each, tasks)] for policy, each in scores.items()]
-    return markdown(["policy", "mean", *(f"`{task.name}`" for task in tasks)], lines)
+def _cell_table() -> str:
+    def guarantee(each: Cell) -> str:
+        with quietly():
+            found = privacy_report(make_config(each.env, each.keywords))
+        pair = f"μ = {found.mu:.2f}, ({found.epsilon:.4g}, {found.claimed_delta:g})"
+        return f"none: {pair}" if found.void_reasons else pair
 
-
-def draw_scores(scores: Scores, tasks: Sequence[Task], path: Path) -> None:
-    """Save the scores of all policies but the references, one panel of dots by task."""
-    heights = {task.name: -k for k, task in enumerate(tasks)}
-    figure = make_figure(8.4, 1.7 + 0.34 * len(tasks))
-    axis = figure.subplots()
-    for k, policy in enumerate(name for name in scores if name not in (ZERO, ONE)):
-        means = [each.mean for each in scores[policy].values()]
-        marker = "o^s"[k // 10 % 3]
-        places = [heights[task] for task in scores[policy]]
-        axis.plot(means, places, marker, color=f"C{k % 10}", label=policy)
-    axis.axvline(0.0, color=GREY, linewidth=0.8)
-    axis.set_xlim(-0.5, 1.05)
-    axis.set_xlabel("score, those below -0.5 left out")
-    axis.set_yticks(list(heights.values()), list(heights))
-    title = f"{NAME}: 0 is the paper's schedule, 1 the error oracle"
-    save_figure(finish_figure(figure), path, title)
-
-
-def _task_table(tasks: Sequence[Task]) -> str:
-    header = ["task", "what it is", "traffic seeds", "guarantee"]
+    header = ["cell", "environment", "traffic seeds", "guarantee"]
     return markdown(
         header,
         [
-            [f"`{task.name}`", task.meaning, format_range(task.seeds), task.guarantee]
-            for task in tasks
+            [
+                f"`{name}`",
+                f"`{each.env.rpartition('/')[2]} {json.dumps(each.keywords)}`",
+                format_range(each.seeds or ()),
+                guarantee(each),
+            ]
+            for name, each in CELLS.items()
         ],
     )
 
 
-_COLUMNS = {
-    DENSITY: "density [veh/km]",
-    SPEED: "speed [km/h]",
-    "chi2_density": "χ² of density",
-    "chi2_speed": "χ² of speed",
-}
+_LEAST = -0.5
 
 
-def _policy_table(rows: pl.DataFrame, task: Task) -> str:
-    """Return errors, honesty and refusals of the policies in a task, the least error first."""
-    lines = []
-    for policy in rows.filter(task=task.name)["policy"].unique().sort():
-        own = pick(rows, _labels(policy, task.name))
-        error = values_of(own, ERROR).mean()
-        met, refused = (float(own[name].sum()) for name in ("n_met", "n_refused"))
-        numbers = [f"{values_of(own, name).mean():.2f}" for name in _COLUMNS]
-        share = f"{100.0 * refused / met:.1f}" if met else "-"
-        lines.append((error, [f"`{policy}`", f"{error:.1f}", *numbers, share]))
-    header = ["policy", "error x 1000", *_COLUMNS.values(), "refused [%]"]
-    return markdown(header, [line for _, line in sorted(lines)])
+def draw_scores(scores: Scores, path: Path) -> None:
+    """Save the scores of all policies but the references, dots by cell."""
+    heights = {name: -k for k, name in enumerate(CELLS)}
+    figure = make_figure(8.4, 1.7 + 0.34 * len(CELLS))
+    axis = figure.subplots()
+    shown = {
+        policy: {name: each.value for name, each in found.items() if each.value > _LEAST}
+        for policy, found in scores.items()
+        if policy not in (ZERO, ONE)
+    }
+    for k, policy in enumerate(name for name, values in shown.items() if values):
+        values = shown[policy]
+        marker = "D" if policy in shipped_policies() else "o^s"[k // 10 % 3]
+        places = [heights[name] for name in values]
+        axis.plot(
+            list(values.values()), places, marker, color=f"C{k % 10}", label=policy, markersize=5
+        )
+    for place in (0.0, 1.0):
+        axis.axvline(place, color=GREY, linewidth=0.8)
+    axis.set_xlim(_LEAST, 1.05)
+    axis.set_xlabel(f"score, those below {_LEAST} left out")
+    axis.set_yticks(list(heights.values()), list(heights))
+    title = f"{NAME}: 0 is the round robin, 1 the gain oracle"
+    save_figure(finish_figure(figure), path, title)
 
 
 STUDY = Study(
     "suite",
-    (
-        *(make_cell(task, rule, rule) for rule in RULES for task in TASKS),
-        *(
-            make_cell(task, policy, policy)
-            for policy, suited in LEARNED.items()
-            for task in TASKS
-            if task.name in suited
-        ),
-    ),
-    ROAD_SEEDS,
+    rule_cells(),
+    SEEDS,
     report,
+    follow=lambda rows, folder: [each for each in learned_cells() if _fits(each)],
 )

@@ -178,7 +178,7 @@ class PlackettLuceSettings(Algorithm):
     name: ClassVar[str] = "plackett-luce"
     action: ClassVar[str] = "slots"
 
-    width: Count = 48
+    width: Count = 32
     """Features per segment of the scorer."""
     regression: Regression = field(default_factory=Regression)
     """The regression, which is round 0 of the training."""

@@ -14,7 +14,7 @@ SHOWN = ("results/*/*.md", "results/*/*.png", "examples/**/*.*")
 ELSEWHERE = {
     "../dptse_env/spaces/actions.py": "reference/spaces.md",
     "../results": "results.md",
-    "../examples": "libraries.md",
+    "../examples": "train-a-policy.md",
 }
 """Pages of the site for links that lead to a file or folder of the repository."""
 

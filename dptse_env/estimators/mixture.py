@@ -26,7 +26,7 @@ class Mixture(BatchEstimator):
         L_i <- (1 - 1 / T) L_i - sum ((y - m_i)^2 / V_i + log V_i) / 2
 
     over all numbers that are released. Its weight is in proportion to exp(L_i); means and variances
-    are those of the mixture. What is released is public, so that the weights are.
+    are those of the mixture. What is released is public, and so are the weights.
 
     Where an expert diverges, all are reset to the prior, and the weights are equal again.
 

@@ -13,6 +13,7 @@ from agents.executors import THIS_PROCESS, LocalProcesses
 from agents.play import Cell, play
 from agents.study import Place, Study, read_rows, run, write_report, write_table
 from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, values
+from dptse_env.estimators.recurrent import read_network
 from tests.agents.faults import SHORT, TRACES, rows_of, study
 from tests.helpers import save_untrained
 
@@ -133,6 +134,9 @@ def test_an_id_says_all_that_rows_depend_on(tmp_path):
         ids |= {replace(first, **change).id for change in there}
     assert len(ids) == 4
     assert not any(str(tmp_path) in each for each in ids if "corridor" in each)
+    # A network of the package by its own name goes with its digest.
+    keywords = {"estimator_settings": {"recurrent": {"weights": "highway-flows"}}}
+    assert read_network("highway-flows").card["sha256"] in replace(first, keywords=keywords).id
 
 
 def test_pairs_are_of_one_version():

@@ -125,7 +125,7 @@ def commands_of(name):
 SMALL = {
     "fit": ["--tries", "1", "--estimators", "ekf", "--rules", "round-robin", "--workers", "1"],
     "evaluate": ["--workers", "1"],
-    "train": ["--algorithm", 'ppo {"steps": 2000}'],
+    "train": ["--steps", "2000"],
 }
 """What makes commands of the page short."""
 

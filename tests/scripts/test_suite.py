@@ -1,61 +1,56 @@
 """The suite by the command."""
 
+import json
+
 import pytest
 
-from agents.study import read_rows
-from scripts import suite
-from tests.agents.studies.test_suite import HERE, KEYWORDS, SMALL, Task
-from tests.helpers import SHORT, save_untrained
+from dptse_env.policies import read_policy
+from tests.agents.studies.test_suite import SMALL, recorded, small  # noqa: F401 (fixtures)
+from tests.helpers import save_untrained
 from tests.scripts.commands import refused, run_command
 
-
-@pytest.fixture
-def small(monkeypatch):
-    flows = {**KEYWORDS, "privacy": "paced"}  # has other blocks in the observation
-    tasks = (SMALL[0], Task("paced", "a guarantee", SHORT, flows, (2000, 2001)))
-    monkeypatch.setattr(suite, "TASKS", tasks)
+pytestmark = pytest.mark.usefixtures("small")
 
 
-def test_policies_are_scored_in_the_tasks_that_they_suit(small, tmp_path):
-    saved = str(save_untrained(tmp_path / "run" / "best.safetensors", estimator="random_walk"))
-    words = "--policies", saved, "round-robin", "--output", tmp_path / "out", "--workers", "1"
-    done = run_command("suite", *words)
+def test_a_policy_gets_a_card_and_its_scores_beside_another_card(tmp_path):
+    words = "--output", tmp_path / "mine", "--workers", "1"
+    done = run_command("suite", "random", *words)
     assert done.returncode == 0, done.stderr
-    assert f"1 of 2 cells do not suit {saved}" in done.stderr
-    rows = read_rows("suite", tmp_path / "out")
-    played = set(rows.select("policy", "task").iter_rows())
-    assert ("run/best", "plain") in played
-    assert ("run/best", "paced") not in played
-    (line,) = (line for line in done.stdout.splitlines() if line.strip().startswith("paced"))
-    assert line.split()[1] == "-"
-    assert "±" in line
-    done = run_command("suite", *words, "--tasks", "paced")
-    assert done.returncode == 2  # the saved policy suits the other task alone
-    assert "tasks must be one of" in refused("suite", *words, "--tasks", "none")
+    card = json.loads((tmp_path / "mine" / "card.json").read_text())
+    assert card["scores"].keys() == SMALL.keys()
+    words = "--beside", tmp_path / "mine/card.json", "--output", tmp_path / "other"
+    done = run_command("suite", "static", *words, "--workers", "1")
+    (line,) = (line for line in done.stdout.splitlines() if line.strip().startswith("mean"))
+    assert f"{card['score']['mean']:.2f} ±" in line
+
+
+def test_the_first_policy_that_suits_a_cell_acts_in_it(tmp_path):
+    saved = save_untrained(tmp_path / "run" / "best.safetensors", estimator="random_walk")
+    words = "--output", tmp_path / "out", "--workers", "1"
+    done = run_command("suite", saved, *words)
+    assert "run/best does not suit paced: policy" in done.stderr
+    card = json.loads((tmp_path / "out" / "card.json").read_text())
+    assert (card["scores"].keys(), card["score"]) == ({"plain"}, None)
+    done = run_command("suite", saved, "static", *words)
+    assert done.returncode == 0, done.stderr
+    card = json.loads((tmp_path / "out" / "card.json").read_text())
+    assert card["score"] is not None
+    acting = {name: each["name"] for name, each in card["policies"].items()}
+    assert acting == {"plain": "run/best", "paced": "static"}
+    assert card["policies"]["plain"]["identity"] == read_policy(saved).card["sha256"]
 
 
 @pytest.mark.parametrize(
-    ("policies", "message"),
+    ("words", "message"),
     [
-        ((), "policies must be one or more"),
-        (("paper", "paper"), "policies must be of different names"),
-        (("nobody.zip",), "nobody.zip"),
+        (("nobody.safetensors",), "nobody.safetensors"),
         (("nobody",), "'nobody'"),
-        ((f"{HERE}:Nobody",), f"{HERE}:Nobody"),
+        (("static", "nobody"), "'nobody' acts in no cell"),
+        (("static", "--beside", "nobody.json"), "nobody.json"),
+        (("static", "--cells", "none"), "cells must be one of"),
+        ((), "policies must be one or more"),
     ],
 )
-def test_bad_policies_are_named_before_anything_is_played(policies, message, small, tmp_path):
-    assert message in refused("suite", "--policies", *policies, "--output", tmp_path / "out")
+def test_bad_input_is_named_before_anything_is_played(words, message, tmp_path):
+    assert message in refused("suite", *words, "--output", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_policy_that_fails_is_one_line_and_finished_rows_stay(monkeypatch, tmp_path):
-    monkeypatch.setattr(suite, "TASKS", SMALL)
-    for _ in range(2):
-        words = "--policies", f"{HERE}:Raising", "--output", tmp_path, "--workers", "1"
-        done = run_command("suite", *words)
-        assert done.returncode == 1
-        line = done.stderr.splitlines()[-1]
-        assert line.startswith(f"error: '{HERE}:Raising' in task wide")
-        assert "ValueError: no third segment" in line
-        assert set(read_rows("suite", tmp_path)["task"]) == {"plain"}

@@ -101,7 +101,7 @@ def test_a_killed_program_goes_on(tmp_path, how, algorithm):
         time.sleep(0.01)
     process.send_signal(how)
     _, err = process.communicate(timeout=240)
-    assert process.returncode == (130 if how == signal.SIGINT else -how)
+    assert process.returncode == (130 if how == signal.SIGINT else -how), err
     assert how == signal.SIGKILL or "the same command goes on" in err
     curves = []
     for run in ("killed", "whole"):

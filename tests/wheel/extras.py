@@ -26,7 +26,7 @@ WITH_TRAIN = {
         ["record", "--env", f"{SHORT[1]} {json.dumps({'corridor': LONGER})}", "--seeds", "0:1"],
     ],
     "ray": [
-        ["suite", "--policies", "static", "--executor", "ray"],
+        ["suite", "static", "--executor", "ray"],
         ["evaluate", "--executor", "ray", "--seeds", "2000:2002", "--output", "ladder"],
     ],
 }

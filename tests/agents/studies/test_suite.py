@@ -1,81 +1,104 @@
 import dataclasses
+import json
 
 import numpy as np
 import polars as pl
 import pytest
 from scipy import stats
 
+import dptse_env
 from agents.executors import THIS_PROCESS
+from agents.play import Cell
 from agents.seeds import SUITE
+from agents.studies import suite
 from agents.studies.suite import (
+    CELLS,
     ONE,
     RECORDED,
-    STUDY,
-    TASKS,
     ZERO,
-    Task,
-    beside_recorded,
-    entry,
-    format_scores,
+    comparable,
+    make_card,
     make_cell,
     mean_score,
+    read_card,
+    recorded_rows,
+    report,
     score,
     score_all,
 )
-from agents.study import Place, read_rows, run
+from agents.study import Place, Study, play_study
 from agents.tables import UnmeasuredError
 from dptse_env.config import TEST_SEEDS
-from dptse_env.schedules import Schedule
 from tests.helpers import SHORT
 
-HERE = "tests.agents.studies.test_suite"
 KEYWORDS = {"estimator": "random_walk", "bandwidth": 2, "horizon": 80}
-SMALL = (
-    Task("plain", "printed noise", SHORT, KEYWORDS, (2000, 2001)),
-    Task("wide", "three queries", SHORT, {**KEYWORDS, "bandwidth": 3}, (2000, 2001)),
-)
+SMALL = {
+    name: Cell(SHORT, keywords={**KEYWORDS, **more}, noise_seed=SUITE.start, transferred=True,
+               seeds=(2000, 2001))
+    for name, more in (("plain", {}), ("paced", {"privacy": "paced"}))
+}  # fmt: skip
 
 
-class Raising(Schedule):
-    """The first segments; raises where three may be queried."""
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A folder with the references and a rule in two small cells."""
+    folder = tmp_path_factory.mktemp("recorded")
+    cells = [dataclasses.replace(each, policy=policy, labels={"name": name, "policy": policy})
+             for name, each in SMALL.items() for policy in ("static", ZERO, ONE)]  # fmt: skip
+    play_study(Study("suite", tuple(cells), (), report), Place(folder, THIS_PROCESS), False)
+    return folder
 
-    def select(self, step, observation):
-        if self.bandwidth == 3:
-            raise ValueError("no third segment")
-        return self.first_that_fit(np.tile(np.arange(6), (len(step), 1)))
+
+@pytest.fixture
+def small(monkeypatch, recorded):
+    """Make these cells the suite; return their rows."""
+    monkeypatch.setattr(suite, "CELLS", SMALL)
+    monkeypatch.setattr(suite, "RULES", ("static", ZERO))
+    monkeypatch.setattr(suite, "ORACLES", (ONE,))
+    monkeypatch.setattr(suite, "RECORDED", recorded)
+    return recorded_rows()
 
 
-def rows_of(**errors):
-    """Return rows in the task ``t``: a policy's errors x 1000, one for each traffic seed."""
+def rows_of(name="t", seeds=range(3), **errors):
+    """Return rows in a cell: a policy's errors x 1000, one for each traffic seed."""
     return pl.DataFrame(
         [
-            {"version": "0.2.0", "task": "t", "policy": policy.replace("_", "-"),
+            {"version": "0.2.0", "name": name, "policy": policy.replace("_", "-"),
              "traffic_seed": seed, "reward": -error / 1000.0}
             for policy, values in errors.items()
-            for seed, error in enumerate(values)
+            for seed, error in zip(seeds, values, strict=True)
         ]
     )  # fmt: skip
 
 
-REFERENCES = {"paper": (100.0, 110.0, 120.0), "oracle_error": (60.0, 50.0, 70.0)}
+REFERENCES = {"round_robin": (100.0, 110.0, 120.0), "oracle_gain": (60.0, 50.0, 70.0)}
 
 
-def test_a_score_is_the_share_of_the_way_to_the_oracle():
+def test_a_score_is_the_share_of_the_way_to_the_gain_oracle():
     rows = rows_of(**REFERENCES, mine=(80.0, 90.0, 70.0))
     for policy, expected in ((ZERO, 0.0), (ONE, 1.0)):
-        found = score(rows, policy, "t")
+        found = mean_score([score(rows, policy, "t")])
         assert (found.mean, found.half_width) == pytest.approx((expected, 0.0), abs=1e-12)
-    found = score(rows, "mine", "t")
-    assert found.mean == pytest.approx(30.0 / 50.0)
+    found = mean_score([score(rows, "mine", "t")])
     gained = np.array([20.0, 20.0, 50.0]) - 0.6 * np.array([40.0, 60.0, 50.0])
     half = stats.t.ppf(0.975, 2) * stats.sem(gained) / 50.0
-    assert (found.low, found.high) == pytest.approx((0.6 - half, 0.6 + half))
-    better = rows_of(**REFERENCES, mine=(40.0, 40.0, 40.0))
-    assert score(better, "mine", "t").mean == pytest.approx(70.0 / 50.0)
+    assert (found.mean, found.low, found.high) == pytest.approx((0.6, 0.6 - half, 0.6 + half))
+    worse = rows_of(**REFERENCES, mine=(130.0, 120.0, 110.0))
+    assert score(worse, "mine", "t").value == pytest.approx(-0.2)
+
+
+def test_the_mean_over_cells_knows_that_they_share_traffic():
+    mine = {"mine": (80.0, 90.0, 70.0)}
+    one = score(rows_of(**REFERENCES, **mine), "mine", "t")
+    other = score(rows_of(seeds=range(5, 8), **REFERENCES, **mine), "mine", "t")
+    width = mean_score([one]).half_width
+    assert mean_score([one, one]).half_width == pytest.approx(width)  # nothing new in it
+    assert mean_score([one, other]).half_width == pytest.approx(width / np.sqrt(2.0))
 
 
 def test_there_is_no_score_without_a_scale_or_across_versions():
-    rows = rows_of(paper=(60.0, 50.0), oracle_error=(100.0, 110.0), mine=(80.0, 90.0))
+    rows = rows_of(round_robin=(60.0, 50.0), oracle_gain=(100.0, 110.0), mine=(80.0, 90.0),
+                   seeds=range(2))  # fmt: skip
     other = rows_of(**REFERENCES, mine=(80.0, 90.0, 70.0)).with_columns(
         version=pl.when(pl.col("policy") == "mine").then(pl.lit("0.3.0")).otherwise("version")
     )
@@ -84,34 +107,44 @@ def test_there_is_no_score_without_a_scale_or_across_versions():
             score(each, "mine", "t")
 
 
-def test_recorded_references_have_zero_and_one_and_a_row_moves_its_score_alone():
-    rows = read_rows("suite", RECORDED)
-    for each in STUDY.cells:
+def test_a_card_gives_back_its_scores_and_is_refused_where_it_cannot_be_compared(small, tmp_path):
+    path, card = (
+        tmp_path / "card.json",
+        make_card(small, "static", [make_cell("plain", "static", "static")]),
+    )
+    assert card["policies"] == {"plain": {"name": "static", "identity": "static"}}
+    assert card["scores"].keys() == SMALL.keys()
+    assert card["score"]["low"] < card["score"]["mean"] < card["score"]["high"]
+    path.write_text(json.dumps(card))
+    theirs = read_card(path)
+    found = score_all(pl.concat([small, theirs], how="diagonal_relaxed"))
+    (policy,) = theirs["policy"].unique()
+    assert {name: each.value for name, each in found[policy].items()} == pytest.approx(
+        {name: interval["mean"] for name, interval in card["scores"].items()}
+    )
+    changes = {
+        "suite": "query-suite-v2",
+        "package": "0.1.0",
+        "cells": "0" * 64,
+        "errors": {"plain": {"2000": 1.0}},
+    }
+    for key, value in changes.items():
+        path.write_text(json.dumps({**card, key: value}))
+        with pytest.raises(ValueError, match=rf"card\.json.*{key}"):
+            read_card(path)
+
+
+def test_references_of_another_version_or_network_are_not_taken(small, monkeypatch):
+    assert set(recorded_rows()["policy"]) == {"static", ZERO, ONE}
+    monkeypatch.setattr(dptse_env, "__version__", "9.9.9")
+    with pytest.raises(ValueError, match=r"9\.9\.9"):
+        recorded_rows()
+
+
+@pytest.mark.skipif(not RECORDED.is_dir(), reason="a source archive has no results")
+def test_recorded_rows_leave_room_above_the_best_rule_in_every_cell():
+    rows = recorded_rows()
+    for name, each in CELLS.items():
         assert set(each.seeds) <= set(TEST_SEEDS[200:])
-        assert each.noise_seed == SUITE.start
-    scores = score_all(rows)
-    assert {mean_score(scores[name]) for name in (ZERO, ONE)} == {0.0, 1.0}
-    assert mean_score(scores["paced-roads"]) is None
-    changed = pl.when(policy="round-robin", task="paper").then(pl.col("reward") * 1.01)
-    worse = score_all(rows.with_columns(changed.otherwise("reward").alias("reward")))
-    moved = {(policy, task) for policy in scores for task in scores[policy]
-             if worse[policy][task] != scores[policy][task]}  # fmt: skip
-    assert moved == {("round-robin", "paper")}
-
-
-def test_a_policy_is_scored_beside_those_that_are_recorded(tmp_path):
-    cells = [make_cell(SMALL[0], "mine", f"{HERE}:Raising")]
-    study = entry(cells, SMALL)
-    # Nobody has recorded these references.
-    assert [each.policy for each in study.cells] == [f"{HERE}:Raising", ZERO, ONE]
-    run(study, Place(tmp_path, THIS_PROCESS), progress=False)
-    rows = beside_recorded(read_rows("suite", tmp_path), study.cells)
-    scores = score_all(rows, SMALL)
-    assert scores[ZERO]["plain"].mean == 0.0
-    shown = " | ".join(format_scores(scores["mine"], SMALL))
-    assert f"| `mine` | {shown} |" in (tmp_path / "tables.md").read_text(encoding="utf-8")
-    # Rows of another file of the same name are left alone.
-    other = dataclasses.replace(cells[0], policy="static")
-    assert "mine" not in set(beside_recorded(read_rows("suite", tmp_path), [other])["policy"])
-    # Where the references are recorded, the policy alone is played.
-    assert entry([make_cell(TASKS[0], "mine", "static")]).cells[1:] == ()
+        assert suite.room(rows, name).mean > 8.0, name
+    assert comparable()["package"] == dptse_env.__version__
