@@ -1,11 +1,9 @@
-"""Watchers that add columns to the rows of episodes: contributions, honesty, queries.
+"""Watchers that add columns to the rows of episodes: contributions, honesty.
 
 All look at the true traffic, for evaluation only.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 from scipy import stats
@@ -14,8 +12,6 @@ from dptse_env.evaluation import WARM_UP, Row, WatcherFactory
 from dptse_env.process import QueryProcess
 from dptse_env.release import Capped, Paced
 from dptse_env.release.vehicles import VehicleRows
-from dptse_env.traffic import draw_scenario
-from dptse_env.traffic.demand import Incident
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
 
 LENGTHS = (0, 30, 60, 90, 120, 150, 180)
@@ -188,126 +184,6 @@ def regimes(speed: FloatArray, occupied: BoolArray) -> tuple[BoolArray, BoolArra
     return jam, front, occupied & ~front & ~jam
 
 
-PHASES = ("before", "during", "after")
-BIN = 20
-"""Length of a bin of time [s]."""
-NEAR = 2
-"""Segments on either side that count as near the incident."""
-
-
-class Queries:
-    """Queries of a batch of episodes by segment and time, relative to their first incident.
-
-    Columns:
-
-    - ``incident``: segment of the incident; -1 without one, and then all is ``before``;
-    - ``start``: second at which it begins; 0 without one;
-    - ``seconds``: seconds before, during and after the incident;
-    - ``before``, ``during``, ``after``: queries of each segment in these phases;
-    - ``near``: queries near the incident in each `BIN` of the episode.
-    """
-
-    def __init__(self, process: QueryProcess) -> None:
-        """Look up the incidents."""
-        n, n_mainline = process.n_episodes, process.interface.n_mainline
-        config = process.config
-        self._process = process
-        seeds = [config.traffic_seeds[index] for index in process.traffic_index]
-        scenarios = [draw_scenario(config.corridor, seed) for seed in seeds]
-        incidents = [next(iter(scenario.incidents), None) for scenario in scenarios]
-        self._segment = np.array([-1 if each is None else each.segment for each in incidents])
-        self._start, self._end = np.array([_span(each) for each in incidents]).T
-        distance = np.abs(np.arange(n_mainline) - self._segment[:, None])
-        self._near = (distance <= NEAR) & (self._segment >= 0)[:, None]
-        self._counts = np.zeros((n, len(PHASES), n_mainline), dtype=np.int64)
-        self._seconds = np.zeros((n, len(PHASES)), dtype=np.int64)
-        self._near_counts = np.zeros((n, -(-config.horizon_steps // BIN)), dtype=np.int64)
-
-    def __call__(self) -> None:
-        """Count the queries of the second that has passed."""
-        process = self._process
-        if process.elapsed[0] == 0:  # the call after the reset, before any query
-            return
-        episodes, time = np.arange(process.n_episodes), process.time
-        phase = (time > self._start).astype(np.int64) + (time > self._end)
-        queried = process.interface.queries.covered(process.queried)
-        self._counts[episodes, phase] += queried
-        self._seconds[episodes, phase] += 1
-        place = (process.elapsed - 1) // BIN
-        self._near_counts[episodes, place] += (queried & self._near).sum(axis=1)
-
-    def rows(self) -> list[Row]:
-        """See `dptse_env.evaluation.Watcher.rows`."""
-        return [
-            {
-                "incident": int(self._segment[k]),
-                "start": float(self._start[k]) if self._segment[k] >= 0 else 0.0,
-                "seconds": self._seconds[k].tolist(),
-                **{name: self._counts[k, i].tolist() for i, name in enumerate(PHASES)},
-                "near": self._near_counts[k].tolist(),
-            }
-            for k in range(len(self._segment))
-        ]
-
-
-def _span(incident: Incident | None) -> tuple[float, float]:
-    """Return when an incident begins and when its last phase ends [s]."""
-    if incident is None:
-        return np.inf, np.inf
-    return incident.start, incident.phases[-1][1]
-
-
-def by_segment(episodes: Sequence[Row]) -> FloatArray:
-    """Return the share of seconds in which each segment is queried, shape (n_mainline,)."""
-    counts = np.sum([each[phase] for each in episodes for phase in PHASES], axis=0)
-    share: FloatArray = counts / sum(sum(each["seconds"]) for each in episodes)
-    return share
-
-
-def by_offset(episodes: Sequence[Row], phase: str) -> tuple[FloatArray, FloatArray]:
-    """Return offsets from the incident's segment, and the share of seconds each is queried.
-
-    Only seconds in which a segment has this offset count. Episodes without an incident are left
-    out.
-    """
-    n = len(episodes[0][phase])
-    queries, seconds = np.zeros(2 * n - 1), np.zeros(2 * n - 1)
-    for each in episodes:
-        if each["incident"] >= 0:
-            window = slice(n - 1 - each["incident"], 2 * n - 1 - each["incident"])
-            queries[window] += each[phase]
-            seconds[window] += each["seconds"][PHASES.index(phase)]
-    seen = seconds > 0
-    return np.arange(1 - n, n)[seen].astype(np.float64), queries[seen] / seconds[seen]
-
-
-def near_since_start(
-    episodes: Sequence[Row], edges: Sequence[float]
-) -> tuple[FloatArray, FloatArray]:
-    """Return seconds since the incident's start, and the share of queries near it.
-
-    Args:
-        episodes: Rows of `Queries`; those without an incident are left out.
-        edges: Edges of intervals of `BIN` seconds from the start on [s]; a bin of an episode counts
-            in the interval that holds its middle.
-    """
-    bounds = np.array(edges, dtype=np.float64)
-    near, queries = np.zeros(len(bounds) - 1), np.zeros(len(bounds) - 1)
-    for each in episodes:
-        if each["incident"] < 0:
-            continue
-        n_seconds = sum(each["seconds"])
-        counts = each["near"][: n_seconds // BIN]  # without a bin that is cut off
-        middle = BIN * (np.arange(len(counts)) + 0.5) - each["start"]
-        place = np.digitize(middle, bounds) - 1
-        inside = (place >= 0) & (place < len(near))
-        total = sum(sum(each[phase]) for phase in PHASES)
-        np.add.at(near, place[inside], np.asarray(counts)[inside])
-        np.add.at(queries, place[inside], total / n_seconds * BIN)
-    seen = queries > 0
-    return (bounds[:-1] + BIN / 2)[seen], near[seen] / queries[seen]
-
-
 class Summary:
     """Honesty and refusals of a batch of episodes, in a few columns.
 
@@ -343,7 +219,6 @@ class Summary:
 WATCHERS: dict[str, WatcherFactory] = {
     "contributions": Contributions,
     "honesty": Honesty,
-    "queries": Queries,
     "summary": Summary,
 }
 """Watchers by the names that cells give."""

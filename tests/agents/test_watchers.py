@@ -10,18 +10,14 @@ from agents.environments import make_config
 from agents.play import Cell, play
 from agents.watchers import (
     LENGTHS,
-    PHASES,
     Contributions,
     Honesty,
-    by_offset,
-    by_segment,
-    near_since_start,
     regimes,
 )
 from dptse_env.estimators import Estimate
 from dptse_env.evaluation import evaluate
 from dptse_env.parts import make_release
-from dptse_env.traffic import RecordLibrary, draw_scenario
+from dptse_env.traffic import RecordLibrary
 from tests.helpers import SHORT
 
 N_MAINLINE = 6
@@ -170,40 +166,6 @@ def test_the_warm_up_and_speeds_of_empty_segments_do_not_count():
     assert found["chi2_density"] == pytest.approx(1.0)
     assert found["chi2_speed"] == 0.0
     assert found["n_free"] == 0.0
-
-
-@pytest.fixture(scope="module")
-def queried():
-    return watch(PACED, ("queries",))
-
-
-def test_queries_are_counted_by_segment_and_phase(queried):
-    corridor = make_config(SHORT, {}).corridor
-    for row, seed in zip(queried, SEEDS, strict=True):
-        incident = draw_scenario(corridor, seed).incidents[0]
-        assert (row["incident"], row["start"]) == (incident.segment, incident.start)
-        assert sum(row["seconds"]) == 240
-        for phase, seconds in zip(PHASES, row["seconds"], strict=True):
-            assert sum(row[phase]) == 2 * seconds
-    np.testing.assert_allclose(by_segment(queried), 1 / 3, atol=0.01)
-
-
-def made_up(incident, start, seconds, counts, near):
-    phases = dict(zip(PHASES, counts, strict=True))
-    return {"incident": incident, "start": start, "seconds": seconds, "near": near, **phases}
-
-
-def test_offsets_and_times_are_counted_from_the_incident():
-    none = [0, 0, 0]
-    rows = [
-        made_up(0, 20.0, [20, 40, 0], ([20, 0, 0], [0, 40, 0], none), [20, 40, 40]),
-        made_up(-1, 0.0, [60, 0, 0], ([60, 0, 0], none, none), [0, 0, 0]),
-    ]
-    offsets, shares = by_offset(rows, "during")
-    assert dict(zip(offsets, shares, strict=True)) == {0.0: 0.0, 1.0: 1.0, 2.0: 0.0}
-    seconds, near = near_since_start(rows, (-20.0, 0.0, 20.0, 40.0))
-    assert seconds.tolist() == [-10.0, 10.0, 30.0]
-    np.testing.assert_allclose(near, [1.0, 2.0, 2.0])
 
 
 @pytest.mark.parametrize("privacy", [PACED, "paper"])
