@@ -51,8 +51,8 @@ class Args(Machines):
     training_seeds: str = "0:5"
     """Seeds of these trainings, first:stop: every learner has the first, the best two all."""
     weights: tuple[str, ...] = ()
-    """Networks for the study of roads, in place of the shipped one, or of estimators, beside it:
-    names, or paths without "-flows.safetensors" and "-speeds.safetensors"; need another output."""
+    """Networks for the studies of roads and estimators: names, or paths without
+    "-flows.safetensors" and "-speeds.safetensors"; need another output."""
     output: Path | None = None
     """Folder of the results; results/NAME if not given, with "-quick" for quick ones."""
 

@@ -5,7 +5,8 @@ dptse train --env dptse_env:dptse/ShortHighway-v0 --keywords '{"bandwidth": 1}' 
 
 The folder gets best.safetensors and policy.safetensors (the policy best in validation, and the
 last), progress.csv and curve.png (the learning curve, beside rules), plan.json (the settings) and
-checkpoint.pt. The same command goes on from the last checkpoint, plackett-luce to the same numbers.
+checkpoint.pt. The same command goes on from the last checkpoint; plackett-luce with a number of
+rounds comes to the same numbers.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Args(Machines):
     """ppo, maskable-ppo, recurrent-ppo, dqn, qr-dqn or plackett-luce, or 'name {JSON}' with
     settings that differ, such as 'ppo {"policy": "mlp"}'."""
     minutes: float | None = None
-    """Time to train for, 10 by default; plackett-luce trains in rounds instead."""
+    """Time of the processor to train for, 10 by default; plackett-luce has a number of rounds."""
     steps: int | None = None
     """Seconds of traffic to train for, all episodes together, in place of minutes."""
     initial: str | None = None

@@ -98,8 +98,9 @@ class Run:
         for row in self.checkpoint["rows"] if self.checkpoint else ():
             self._append(row)
         self._best = min(map(least, self.rows), default=np.inf)
-        # The clock of the training starts when the rules have been played.
-        self._begun = time.perf_counter() - (self.rows[-1]["seconds"] if self.rows else 0.0)
+        # The clock of the training starts when the rules have been played. It is that of the
+        # processor, so that what else runs on a machine takes nothing from a training.
+        self._begun = time.process_time() - (self.rows[-1]["seconds"] if self.rows else 0.0)
 
     @property
     def steps(self) -> int:
@@ -109,7 +110,7 @@ class Run:
     def done(self, steps: int) -> float:
         """Return the fraction of a training by minutes or by steps that is done."""
         if self.plan.minutes is not None:
-            return min((time.perf_counter() - self._begun) / (60.0 * self.plan.minutes), 1.0)
+            return min((time.process_time() - self._begun) / (60.0 * self.plan.minutes), 1.0)
         assert self.plan.steps is not None
         return min(steps / self.plan.steps, 1.0)
 
@@ -120,7 +121,7 @@ class Run:
             steps: Seconds of traffic that were simulated for it, all environments together.
             values: Further columns.
         """
-        seconds = round(time.perf_counter() - self._begun, 1)
+        seconds = round(time.process_time() - self._begun, 1)
         row = {"update": len(self.rows), "steps": steps, "seconds": seconds, **values}
         self._append(row)
         if self._board is not None:

@@ -163,9 +163,9 @@ class SwapRounds:
         """Check values."""
         checked_fields(self, "algorithm.swaps")
 
-    def step_of(self, index: int) -> float:
-        """Return the step of a round, counted from 0."""
-        return self.step + (self.final_step - self.step) * index / max(self.rounds - 1, 1)
+    def step_of(self, done: float) -> float:
+        """Return the step of a round, by the fraction of the way to the last round."""
+        return self.step + (self.final_step - self.step) * done
 
 
 @dataclass(frozen=True)
@@ -454,9 +454,9 @@ class TrainingPlan:
         seed: Seeds the initial weights, draws of actions, noise and the choice of traffic.
         traffic_seeds: Traffic to train on.
         validation_seeds: Traffic to validate on.
-        minutes: Time to train for, validations included; None where there are ``steps``. The rounds
-            of plackett-luce have neither.
-        steps: Seconds of traffic to train for, all episodes together.
+        minutes: Time of the processor to train for, validations included; None where there are
+            ``steps``, or where plackett-luce has a number of rounds.
+        steps: Seconds of traffic to train for, all episodes together; not for plackett-luce.
         initial: Saved `RoadPolicy` to begin with, for PPO.
 
     Raises:
@@ -482,15 +482,17 @@ class TrainingPlan:
             positive("minutes", self.minutes)
         if self.steps is not None:
             integer("steps", self.steps, 1)
-        given = sum(each is not None for each in (self.minutes, self.steps))
-        name, is_learner = self.algorithm.name, isinstance(self.algorithm, LearnerSettings)
-        if given != is_learner:
+        name = self.algorithm.name
+        if isinstance(self.algorithm, LearnerSettings):
+            if (self.minutes is None) == (self.steps is None):
+                raise ValueError(
+                    f"minutes or steps must be given for {name}, one of them, got "
+                    f"{self.minutes} and {self.steps}"
+                )
+        elif self.steps is not None:
             raise ValueError(
-                f"minutes or steps must be given for {name}, one of them, got "
-                f"{self.minutes} and {self.steps}"
-                if is_learner
-                else f"minutes and steps are not for {name}, which trains in rounds: "
-                "set algorithm.swaps.rounds"
+                f"steps are not for {name}, which trains in rounds: give minutes, or set "
+                f"algorithm.swaps.rounds"
             )
         is_road = isinstance(self.algorithm, LearnerSettings) and self.algorithm.policy == "road"
         if self.initial is not None:

@@ -62,8 +62,8 @@ def train_in_rounds(run: Run) -> None:
     """Train a `RoadPolicy` in rounds: the regression, then those of swaps.
 
     Every round leaves a checkpoint with everything that the next one depends on: a training that
-    was killed goes on to the same bits, on the same machine with the same number of torch's
-    threads, and repeats at most the round that it was in.
+    was killed repeats at most the round that it was in. With a number of rounds it goes on to the
+    same bits, on the same machine with the same number of torch's threads.
     """
     plan, algorithm, kept = run.plan, run.plan.algorithm, run.checkpoint
     assert isinstance(algorithm, PlackettLuceSettings)
@@ -82,28 +82,39 @@ def train_in_rounds(run: Run) -> None:
     def show(stage: str, fraction: float) -> None:
         # A round's swaps and its fit count alike, and the regression as one round.
         part = fraction if stage == "regression" else 0.5 * (fraction + (stage == "fit"))
-        run.progress((len(run.rows) + part) / (algorithm.swaps.rounds + 1), stage)
+        in_rounds = (len(run.rows) + part) / (algorithm.swaps.rounds + 1)
+        run.progress(in_rounds if plan.minutes is None else run.done(run.steps), stage)
 
     if kept is None:
         end(_regress(run, algorithm, policies, partial(show, "regression")), {})
-    done, settings = len(run.rows) - 1, algorithm.swaps
+    settings, lasted = algorithm.swaps, 0.0
+
+    def next_round() -> float | None:
+        """Return the fraction of the way to the last round; None if there is no further one."""
+        if plan.minutes is not None and settings.rounds:
+            done = run.done(run.steps)
+            return done if done + 0.5 * lasted < 1.0 else None  # half of it must fit
+        index = len(run.rows) - 1
+        return index / max(settings.rounds - 1, 1) if index < settings.rounds else None
+
     environments = [
         make_vector(world.env, world.part(settings.episodes), {**world.keywords, **run.keywords})
         for world in plan.worlds
-        if done < settings.rounds
+        if next_round() is not None
     ]
     # In every fork the seconds of an episode pass once more, under noise and its opposite.
     seconds = sum(env.num_envs * env.config.horizon_steps for env in environments)
     seconds *= 1 + 2 * (1 + settings.trials)
-    for index in range(done, settings.rounds):
+    while (done := next_round()) is not None:
+        index = len(run.rows) - 1
         tried = [
             try_swaps(policy, env, settings, index, plan.seed, partial(show, "swaps"))
             for policy, env in zip(policies, environments, strict=True)
         ]
-        step = settings.step_of(index)
-        raise_scores(policies, tried, settings, step, partial(show, "fit"))
+        raise_scores(policies, tried, settings, settings.step_of(done), partial(show, "fit"))
         error = sum(float(swaps.error.mean()) for swaps in tried) / len(tried)
         end(run.steps + seconds, {"error": error})
+        lasted = run.done(run.steps) - done if plan.minutes is not None else 0.0
 
 
 def _regress(

@@ -71,7 +71,7 @@ def test_a_card_without_recipe_or_training_seed_is_refused(tmp_path, training):
 def test_a_converted_policy_keeps_its_identity_in_recorded_results():
     saved = read_saved_policy("private-highway")
     assert saved.identity.startswith("5efbbd09f911b3d1")
-    rows = pl.read_parquet(Path(__file__).parents[2] / "results" / "policies" / "rows.parquet")
+    rows = pl.read_parquet(Path(__file__).parents[2] / "results" / "suite" / "rows.parquet")
     assert rows["cell"].str.contains(f"sha256:{saved.identity}").any()
 
 

@@ -110,8 +110,6 @@ class Setting(NamedTuple):
         description: What it is, in tables.
         env: Environment id.
         keywords: Keywords of the environment.
-        regression: Time that the regression of Plackett-Luce takes on one core [min].
-        swaps: Time that one of its rounds of swaps takes on one core [min].
         traffic: Traffic seeds.
         changes: What differs from tuned settings, by algorithm.
     """
@@ -119,8 +117,6 @@ class Setting(NamedTuple):
     description: str
     env: str
     keywords: Mapping[str, Any]
-    regression: float
-    swaps: float
     traffic: Traffic = TRAFFIC
     changes: Mapping[str, Mapping[str, Any]] = {}
 
@@ -130,15 +126,15 @@ _PACED: dict[str, Any] = {"privacy": {"preset": "paced", "epsilon": 5.0}}
 _RECURRENT: dict[str, Any] = {"estimator": "recurrent", "bandwidth": 2}
 _CAPPED: dict[str, Any] = {"bandwidth": 5, "privacy": {"preset": "capped", "epsilon": 5.0}}
 SETTINGS = {
-    "short": Setting("ShortHighway-v0, B = 1", SHORT, _ONE, 1.0, 0.5),
-    "short-paced": Setting("ShortHighway-v0, paced, B = 1", SHORT, _ONE | _PACED, 1.0, 0.5),
-    "private-1": Setting("PrivateHighway-v1, B = 1", PRIVATE, _ONE, 2.5, 2.0),
-    "private-2": Setting("PrivateHighway-v1, B = 2", PRIVATE, _TWO, 2.5, 2.0),
-    "long": Setting("LongHighway-v0, B = 2", LONG, _TWO, 2.0, 1.0, LONG_TRAFFIC, LONG_CHANGES),
+    "short": Setting("ShortHighway-v0, B = 1", SHORT, _ONE),
+    "short-paced": Setting("ShortHighway-v0, paced, B = 1", SHORT, _ONE | _PACED),
+    "private-1": Setting("PrivateHighway-v1, B = 1", PRIVATE, _ONE),
+    "private-2": Setting("PrivateHighway-v1, B = 2", PRIVATE, _TWO),
+    "long": Setting("LongHighway-v0, B = 2", LONG, _TWO, LONG_TRAFFIC, LONG_CHANGES),
     "long-recurrent": Setting(
-        "LongHighway-v0, recurrent, B = 2", LONG, _RECURRENT, 2.0, 1.0, LONG_TRAFFIC, LONG_CHANGES
+        "LongHighway-v0, recurrent, B = 2", LONG, _RECURRENT, LONG_TRAFFIC, LONG_CHANGES
     ),
-    "paper": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED, 2.5, 2.0),
+    "paper": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED),
 }
 CURVES = "curves.parquet"
 """Learning curves of the trainings that are finished, a line for each validation, with the digest

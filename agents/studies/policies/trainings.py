@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -33,7 +32,7 @@ from agents.studies.policies import (
 from agents.study import Place, Study, play_study, write_table
 from agents.training.run import BEST, CURVE, RULES_FILE
 from agents.training.run_files import PLAN, check_plan, keep_plan, read_progress
-from agents.training.settings import PlackettLuceSettings, TrainingPlan, parse_algorithm
+from agents.training.settings import TrainingPlan, parse_algorithm
 from agents.training.training import train
 from dptse_env.traffic import Records
 from dptse_env.utils.fields import positive
@@ -125,8 +124,6 @@ def fits(setting: str, learner: str) -> bool:
 def plan_of(training: Training, study: Path, minutes: float) -> TrainingPlan:
     """Return the plan of a training.
 
-    Plackett-Luce has as many rounds as take about so many minutes on one core.
-
     Args:
         training: The training. What it starts from is finished.
         study: Folder of the study.
@@ -140,18 +137,13 @@ def plan_of(training: Training, study: Path, minutes: float) -> TrainingPlan:
         n_segments = make_config(setting.env, setting.keywords).corridor.n_mainline
     given = {**setting.changes.get(name, {}), **own}
     algorithm = parse_algorithm(f"{name} {json.dumps(given)}", n_segments)
-    in_rounds = isinstance(algorithm, PlackettLuceSettings)
-    if isinstance(algorithm, PlackettLuceSettings):
-        rounds = max(round((minutes - setting.regression) / setting.swaps), 1)
-        swaps = dataclasses.replace(algorithm.swaps, rounds=rounds)
-        algorithm = dataclasses.replace(algorithm, swaps=swaps)
     return TrainingPlan(
         (f"{setting.env} {json.dumps(setting.keywords)}",),
         algorithm,
         training.seed,
         setting.traffic.training,
         setting.traffic.validation,
-        None if in_rounds else minutes,
+        minutes,
         initial=str(training.start.folder(study) / BEST) if learner == STARTED else None,
     )
 

@@ -179,14 +179,10 @@ def test_every_learner_has_a_plan_in_the_settings_that_it_fits():
             assert plan_of(Training(setting, learner, 0), Path(), 10.0).worlds
 
 
-def test_plackett_luce_has_as_many_rounds_as_the_time_allows():
-    setting = policies.SETTINGS["long"]
+def test_what_a_training_starts_from_has_half_of_its_time():
     whole = plan_of(Training("long", "plackett-luce", 3), Path(), 10.0)
-    half = plan_of(Training("long", START, 3), Path(), 10.0)
-    assert whole.algorithm.swaps.rounds == round((10 - setting.regression) / setting.swaps)
-    assert half.algorithm.swaps.rounds == round((5 - setting.regression) / setting.swaps)
-    assert (whole.seed, whole.minutes, whole.algorithm.n_envs) == (3, None, 16)
-    assert plan_of(Training("long", START, 0), Path(), 0.1).algorithm.swaps.rounds == 1
+    assert (whole.seed, whole.minutes, whole.algorithm.n_envs) == (3, 10.0, 16)
+    assert plan_of(Training("long", START, 3), Path(), 10.0).minutes == 5.0
     assert plan_of(Training("long", "ppo-road", 0), Path(), 10.0).algorithm.validations == 12
 
 
@@ -201,17 +197,16 @@ def test_a_time_that_is_none_is_refused_and_nothing_written(tmp_path):
 def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     keywords = {"estimator": "random_walk", "bandwidth": 1, "horizon": 80, "privacy": "capped"}
     traffic = policies.Traffic((0, 1), (1000, 1001), (2000, 2001, 2002), (2000, 2001))
-    setting = policies.Setting("a short road", SHORT, keywords, 0.001, 0.001, traffic)
+    setting = policies.Setting("a short road", SHORT, keywords, traffic)
     learners = {
         "ppo-perceptron": ("ppo", {**SMALL["ppo"], "policy": "mlp"}),
         "qr-dqn": ("qr-dqn", SMALL["qr-dqn"]),
         "plackett-luce": ("plackett-luce", SMALL["plackett-luce"]),
         STARTED: ("ppo", {k: v for k, v in SMALL["ppo"].items() if k != "hidden"}),
     }
-    rounds = {"regression": setting.regression, "swaps": 0.02}
     for module in (policies, policies.trainings):
         monkeypatch.setattr(module, "LEARNERS", learners)
-        monkeypatch.setattr(module, "SETTINGS", {"short": setting._replace(**rounds)})
+        monkeypatch.setattr(module, "SETTINGS", {"short": setting})
         monkeypatch.setattr(module, "RULES", (ROUND_ROBIN, "paper"))
     cells = tuple(policies._cell("short", rule, VALIDATION) for rule in (ROUND_ROBIN, "paper"))
     study = policies.Study("policies", cells, (), policies.report, policies.test_cells)

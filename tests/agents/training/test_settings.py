@@ -26,7 +26,7 @@ def test_settings_that_are_given_replace_single_ones():
     given = parse_algorithm(
         'plackett-luce {"swaps": {"step": 9.0, "final_step": 1, "rounds": 5}}', 6
     )
-    assert [given.swaps.step_of(k) for k in (0, 1, 4)] == [9.0, 7.0, 1.0]
+    assert [given.swaps.step_of(k) for k in (0.0, 0.25, 1.0)] == [9.0, 7.0, 1.0]
     assert given.regression == ALGORITHMS["plackett-luce"].regression
     road, mlp = parse_algorithm("ppo", 6), parse_algorithm('ppo {"policy": "mlp"}', 6)
     assert (road.policy, road.learning_rate, road.final_ent_coef) == ("road", 1e-3, 0.0)
@@ -135,7 +135,7 @@ def test_plans_that_are_refused(changes, message):
         ("ppo", {"minutes": 1.0, "steps": 9}, "minutes or steps must be given for ppo, one of"),
         ("ppo", {"minutes": 0.0, "steps": None}, "minutes must be a finite number > 0, got 0"),
         ("ppo", {"steps": 0}, "steps must be an integer >= 1, got 0"),
-        ("plackett-luce", {"minutes": 3.0}, "not for plackett-luce, which trains in rounds"),
+        ("plackett-luce", {"steps": 3}, "not for plackett-luce, which trains in rounds"),
         ("dqn", {"initial": "paced-roads"}, "initial must be left out .*, got 'paced-roads'"),
     ],
 )

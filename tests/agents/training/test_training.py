@@ -202,6 +202,13 @@ def test_a_training_by_minutes_ends_in_time(tmp_path):
     assert rows[-1]["steps"] > 0
 
 
+def test_rounds_go_on_for_some_minutes(tmp_path):
+    rows = train(make_plan(minutes=0.04), tmp_path)
+    ends = np.array([row["seconds"] for row in rows])
+    assert len(rows) > 3  # more than two rounds
+    assert ends[-1] >= 2.4 - 0.6 * np.diff(ends).max()
+
+
 @pytest.mark.parametrize(
     "name", fast_and_slow(SMALL, ["plackett-luce", "ppo", "recurrent-ppo", "qr-dqn"])
 )
