@@ -88,7 +88,7 @@ class SavedPolicy:
 
     @property
     def deterministic(self) -> bool:
-        """Whether it takes its likeliest action unless told otherwise."""
+        """True if it takes its likeliest action unless told otherwise."""
         return bool(self.card["acts"] == DETERMINISTIC)
 
     @property

@@ -41,7 +41,7 @@ class Args:
     """Turn a model of stable-baselines3 or sb3-contrib into a saved policy."""
 
     verb: Annotated[Literal["import"], Positional]
-    """What to do with the model: import it."""
+    """The one action: import."""
     model: Annotated[Path, Positional]
     """The model, a .zip file."""
     output: Path
@@ -53,7 +53,7 @@ class Args:
     vecnormalize: Path | None = None
     """The statistics of VecNormalize, .pkl, if it was trained with any."""
     acts: Literal["deterministic", "drawn"] = "deterministic"
-    """Whether it is to take its likeliest actions or to draw them."""
+    """Mode of its actions: the likeliest, or drawn ones."""
     trust: bool = False
     """Unpickle the files, which can run any code that is in them."""
     force: bool = False

@@ -154,7 +154,7 @@ def _moments(scaled: VecNormalize) -> tuple[Any, Any]:
 
 
 class Memory(NamedTuple):
-    """What a policy remembers that acts in another encoding than its own.
+    """Memory of a policy that acts in another encoding than its own.
 
     Attributes:
         state: Of the policy itself.
