@@ -186,13 +186,16 @@ def network_for(weights: str | None, network: RoadNetwork, flows: bool) -> Saved
     if weights is not None:
         return read_network(member_for(weights, flows))
     members = (member_for(name, flows) for name in SHIPPED)
-    suited = [read_network(each) for each in members if each in shipped_networks()]
-    return next((each for each in suited if not outside(each, network, flows, 1)), suited[-1])
+    for saved in (read_network(each) for each in members if each in shipped_networks()):
+        if not outside(saved, network, flows, 1):
+            break
+    return saved
 
 
-def shipped_networks() -> list[str]:
+@cache
+def shipped_networks() -> tuple[str, ...]:
     """Return the names of the networks that come with the package."""
-    return sorted(path.stem for path in _FOLDER.glob(f"*{_SUFFIX}"))
+    return tuple(sorted(path.stem for path in _FOLDER.glob(f"*{_SUFFIX}")))
 
 
 def member_for(source: str, flows: bool) -> str:
