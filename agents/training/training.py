@@ -178,13 +178,22 @@ def train_all(
     tasks = [(plan, folder.absolute()) for folder, plan in plans.items()]
 
     def take(task: tuple[TrainingPlan, Path], _: None) -> None:
-        if not (task[1] / POLICY).exists():
-            raise ExecutorError(
-                f"a worker has trained in {task[1]}, which is not on a disk that it shares "
-                "with this machine: choose an --output that all nodes have"
-            )
+        require_trained(task[1], POLICY)
 
     run_shown(executor, work, tasks, take, progress=progress, desc="training", unit="training")
+
+
+def require_trained(folder: Path, file: str) -> None:
+    """Refuse the end of a training whose folder does not have its file.
+
+    Raises:
+        ExecutorError: The worker writes to another disk than this machine's.
+    """
+    if not (folder / file).exists():
+        raise ExecutorError(
+            f"a worker has trained in {folder}, which is not on a disk that it shares "
+            "with this machine: choose an --output that all nodes have"
+        )
 
 
 def _train_there(task: tuple[TrainingPlan, Path], records: Records, threads: int) -> None:

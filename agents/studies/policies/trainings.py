@@ -13,7 +13,7 @@ import polars as pl
 import torch
 
 from agents.environments import make_config, quietly
-from agents.executors import ExecutorError, run_shown
+from agents.executors import run_shown
 from agents.files import write_json
 from agents.play import record
 from agents.policies import read_saved_policy
@@ -33,7 +33,7 @@ from agents.study import Place, Study, play_study, write_table
 from agents.training.run import BEST, CURVE, RULES_FILE
 from agents.training.run_files import PLAN, check_plan, keep_plan, read_progress
 from agents.training.settings import TrainingPlan, parse_algorithm
-from agents.training.training import train
+from agents.training.training import require_trained, train
 from dptse_env.traffic import Records
 from dptse_env.utils.fields import positive
 
@@ -158,11 +158,7 @@ def _train_missing(
     missing = [(each, rules[each.setting]) for each in trainings if not each.is_finished(study)]
 
     def take(task: tuple[Training, Any], _: None) -> None:
-        if not task[0].is_finished(study):
-            raise ExecutorError(
-                f"a worker has trained in {task[0].folder(study)}, which is not on a disk that it "
-                "shares with this machine: choose an --output that all nodes have"
-            )
+        require_trained(task[0].folder(study), CURVE)
         keep_curves(study)
 
     work = partial(_train_there, study=study, minutes=minutes, records=place.records)
