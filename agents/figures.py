@@ -280,6 +280,14 @@ def draw_level(axis: Axes, interval: Interval, label: str) -> None:
     axis.axhspan(interval.low, interval.high, color=GREY, alpha=0.11, linewidth=0)
 
 
+def draw_rule(axis: Axes, rule: str, error: float) -> None:
+    """Draw the error of a rule as a line with its name at the right end."""
+    axis.axhline(error, color=GREY, linestyle=":", linewidth=1.0)
+    axis.annotate(
+        rule, (1.0, error), xycoords=("axes fraction", "data"), fontsize=7, ha="right", va="bottom"
+    )
+
+
 def set_log_axes(axis: Axes, ticks: Sequence[float]) -> None:
     """Make both axes logarithmic with plain numbers, the upright one for errors."""
     axis.set_xscale("log")

@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.environments import make_vector
-from agents.figures import COLOURS, GREY, finish_figure, make_figure, save_figure
+from agents.figures import COLOURS, draw_rule, finish_figure, make_figure, save_figure
 from agents.files import write_json
 from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
@@ -281,11 +281,7 @@ def draw_curve(rows: Sequence[Row], rules: Mapping[str, float]) -> Figure:
         errors = [1000.0 * row[column] for row in rows]
         axis.plot(steps, errors, color=colour, label=label, marker=".")
     for rule, error in sorted(rules.items(), key=lambda each: each[1]):
-        axis.axhline(1000.0 * error, color=GREY, linestyle=":", linewidth=1.0)
-        axis.annotate(
-            rule, (1.0, 1000.0 * error), xycoords=("axes fraction", "data"), fontsize=7,
-            va="bottom", ha="right",
-        )  # fmt: skip
+        draw_rule(axis, rule, 1000.0 * error)
     # What an untrained policy takes for likeliest may err far more than anything else.
     shown = [1000.0 * each for each in (*rules.values(), *map(least, rows))]
     margin = 0.1 * (max(shown) - min(shown))

@@ -397,7 +397,7 @@ best rule errs by 95.3 (x 1000): 87.0 after eight minutes on one core, 96.5 with
 """
 
 ROAD = {"policy": "road", "learning_rate": 1e-3, "ent_coef": 0.01, "final_ent_coef": 0.0}
-"""What is otherwise for PPO with a `RoadPolicy`, its default.
+"""Settings of PPO with a `RoadPolicy`, its default, that differ from those of a perceptron.
 
 On `PrivateHighway-v1` with one query a second, after 2.5 minutes: with the perceptron's settings
 1.2 +- 2.1 % below the best rule, with these and `ReplicaBaseline` 2.7 +- 1.8 %, and 5.6 +- 1.9 %
@@ -405,7 +405,7 @@ after 17 minutes. On `ShortHighway-v0` 9.6 +- 1.0 % after five.
 """
 
 LONG_ROAD = {"n_envs": 64, "horizon": 400, "n_steps": 32, "batch_size": 512, "n_epochs": 3}
-"""What is otherwise for PPO on a road of `LONG` segments or more, whose seconds cost more.
+"""Settings of PPO that differ on a road of `LONG` segments or more, whose seconds cost more.
 
 On `LongHighway-v0` with two queries a second 4.3 +- 2.7 % below the best rule after eight minutes.
 """

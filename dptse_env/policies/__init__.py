@@ -18,7 +18,7 @@ TRANSFERABLE = ("corridor", "bandwidth")
 """Properties that a caller may allow to differ between a policy and its environment."""
 
 DETERMINISTIC, DRAWN = "deterministic", "drawn"
-"""How a policy acts, as its card says: by its likeliest action, or by a random one."""
+"""Modes of a policy on its card: it takes its likeliest action, or draws one."""
 
 _FOLDER = Path(__file__).parent
 _FIELDS: Mapping[str, type] = {

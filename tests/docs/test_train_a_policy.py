@@ -23,7 +23,7 @@ LESS = {
     'num_envs=8, traffic_seeds="2000:2008"': 'num_envs=2, traffic_seeds="2000:2002"',
     "range(2000, 2008)": "range(2000, 2002)",
 }
-"""What stands on the page, and what is run in its place."""
+"""Passages of the page, and those that are run in their place."""
 
 
 @pytest.mark.slow

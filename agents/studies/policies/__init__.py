@@ -30,6 +30,7 @@ from agents.figures import (
     Look,
     draw_curve,
     draw_dot,
+    draw_rule,
     finish_figure,
     make_figure,
     save_figure,
@@ -351,11 +352,7 @@ def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
         except UnmeasuredError:
             continue
         for rule, error in shown.items():
-            axis.axhline(error, color=GREY, linestyle="--", linewidth=0.9)
-            axis.annotate(
-                rule, (1.0, error), xycoords=("axes fraction", "data"), fontsize=7, ha="right",
-                va="bottom",
-            )  # fmt: skip
+            draw_rule(axis, rule, error)
         for learner, colour in zip(LEARNERS, _COLOURS, strict=False):
             own = curves.filter(setting=name, policy=learner).sort("training_seed", "seconds")
             for _, each in own.group_by("training_seed", maintain_order=True):

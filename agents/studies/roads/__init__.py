@@ -176,7 +176,7 @@ def study(weights: Sequence[str] = ()) -> Study:
     Raises:
         FileNotFoundError: There is no such network.
     """
-    who = [*((name, "", "") for name in (*FILTERS, NETWORK, MIXTURE))]
+    who = [(name, "", "") for name in (*FILTERS, NETWORK, MIXTURE)]
     who += [(NETWORK, each, named(each)) for each in weights]
     cells = [
         each
