@@ -116,7 +116,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     ``mu`` in ``privacy``.
 
     **Arguments** of ``gym.make``, with the defaults of ``PaperHighway-v0``. All are plain JSON, but
-    for parts of your own (a class or ``"package.module:Class"``). ``docs/configuration.md`` has
+    for parts of your own (a class or ``"package.module:Class"``). ``docs/reference/configuration.md`` has
     every field of those that take a mapping.
 
     | argument             | default         | meaning                                             |

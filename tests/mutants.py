@@ -4,7 +4,7 @@
 their module there, and prints which test has caught each; with words only the mutants whose name,
 file or line of the proof has one of them. It ends with status 1 where a mutant lives, which is a
 missing test, or where tests fail without one. It takes a quarter of an hour: run it after a change
-to what ``docs/proof.md`` names.
+to what ``docs/privacy/proof.md`` names.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Mutant(NamedTuple):
 
     Attributes:
         name: What is wrong with it.
-        line: Line of the proof in ``docs/proof.md`` that it breaks.
+        line: Line of the proof in ``docs/privacy/proof.md`` that it breaks.
         path: File below ``dptse_env``.
         old: Text that stands there exactly once.
         new: What takes its place.
@@ -717,7 +717,7 @@ MUTANTS = (
 
 def lines_of_the_proof() -> dict[int, str]:
     """Return the titles of the lines of the proof by their numbers."""
-    page = (ROOT / "docs" / "proof.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "privacy" / "proof.md").read_text(encoding="utf-8")
     return {int(n): title for n, title in re.findall(r"^### (\d+)\. (.+)$", page, re.MULTILINE)}
 
 

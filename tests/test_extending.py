@@ -1,4 +1,4 @@
-"""The examples of docs/extending.md run as they stand."""
+"""The examples of docs/guides/your-own-part.md run as they stand."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+PAGE = Path(__file__).parents[1] / "docs" / "guides" / "your-own-part.md"
 SECTION = re.compile(r"^## ([^\n]*)\n(?:(?!^## ).)*?```python\n(.*?)```", re.DOTALL | re.MULTILINE)
 EXAMPLES = dict(SECTION.findall(PAGE.read_text(encoding="utf-8")))
 

@@ -1,6 +1,6 @@
 """The meaning of a file of trajectories: format, columns, units, and the road's place in it.
 
-All of it can be given in a TOML file with the fields of `Source`; ``docs/own_data.md`` has
+All of it can be given in a TOML file with the fields of `Source`; ``docs/guides/your-data.md`` has
 examples.
 """
 

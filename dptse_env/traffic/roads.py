@@ -6,7 +6,7 @@ The corridors that come with the package have an `average_dwell` measured on the
 A road file is a corridor, and the keywords of an environment that suit it. It has the fields of
 `Corridor`, with tables for ``demand``, ``incident``, ``drivers`` and ``recordings``, whose folder
 may be relative to the file, and a table ``environment`` of keywords of ``gym.make`` that hold on
-this road unless the caller gives them. ``docs/own_road.md`` has the format and an example.
+this road unless the caller gives them. ``docs/guides/your-road.md`` has the format and an example.
 """
 
 from __future__ import annotations

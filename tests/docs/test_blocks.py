@@ -18,7 +18,7 @@ from tests.helpers import fast_and_slow
 
 from .blocks import BLOCKS, PAGES, ROOT
 
-RUN_ELSEWHERE = {"tutorial.md", "extending.md", "own_road.md", "train-a-policy.md"}
+RUN_ELSEWHERE = {"tutorial.md", "your-own-part.md", "your-road.md", "train-a-policy.md"}
 RUN = {block.page for block in BLOCKS if block.language == "python"} - RUN_ELSEWHERE
 
 

@@ -12,7 +12,8 @@ from dptse_env.privacy import DELTAS, epsilon_of, mu_of, over_trips
 from .blocks import ROOT
 
 GUARANTEE, PROOF = (
-    (ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("guarantee.md", "proof.md")
+    (ROOT / "docs" / "privacy" / name).read_text(encoding="utf-8")
+    for name in ("guarantee.md", "proof.md")
 )
 MUS = [mu_of(*pair) for pair in ((1.0, 0.05), (5.0, 1e-6), (5.0, 0.05))]
 TITLE = re.compile(r"^### (\d+)\. ", re.MULTILINE)

@@ -14,8 +14,13 @@ from .blocks import ROOT, blocks_of
 from .test_blocks import commands
 
 END = "## What a fit does"
-BLOCKS = blocks_of(ROOT / "docs" / "own_road.md")
-LINE = (ROOT / "docs" / "own_road.md").read_text(encoding="utf-8").partition(END)[0].count("\n")
+BLOCKS = blocks_of(ROOT / "docs" / "guides" / "your-road.md")
+LINE = (
+    (ROOT / "docs" / "guides" / "your-road.md")
+    .read_text(encoding="utf-8")
+    .partition(END)[0]
+    .count("\n")
+)
 
 
 @pytest.mark.slow

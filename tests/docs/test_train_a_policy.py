@@ -31,7 +31,7 @@ def test_the_page_trains_compares_and_enters_the_suite(tmp_path, monkeypatch):
     pytest.importorskip("stable_baselines3", reason="the extra train is not installed")
     monkeypatch.chdir(tmp_path)
     names, printed, replaced = {"__name__": "documentation"}, io.StringIO(), set()
-    for block in blocks_of(ROOT / "docs" / "train-a-policy.md"):
+    for block in blocks_of(ROOT / "docs" / "guides" / "train-a-policy.md"):
         text = block.text
         for whole, part in LESS.items():
             replaced |= {whole} if whole in text else set()

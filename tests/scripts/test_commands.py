@@ -84,7 +84,7 @@ def test_the_example_of_the_help_runs_as_it_is_printed(name, tmp_path, monkeypat
 
 
 def test_the_overview_has_every_command_and_so_has_the_page():
-    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
     overview = run_command("--help").stdout
     for name in MODULES:
         assert f"\n  {name} " in overview

@@ -101,7 +101,7 @@ def test_what_is_wrong_with_trajectories_is_said(words, message, road, tmp_path)
 def fifteen_minutes(tmp_path_factory):
     """A folder with the files of the page on data, and 15 minutes of simulated NGSIM rows."""
     folder = tmp_path_factory.mktemp("page")
-    page = (ROOT / "docs" / "own_data.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "guides" / "your-data.md").read_text(encoding="utf-8")
     for name, content in re.findall(r"```toml\n# (\S+)\n(.*?)```", page, re.DOTALL):
         (folder / name).write_text(content)
     flows = Demand(((0.0, 4000.0), (300.0, 6500.0), (600.0, 4500.0)), (400.0,))
@@ -118,7 +118,7 @@ def fifteen_minutes(tmp_path_factory):
 
 def commands_of(name):
     """Return the command lines of a page."""
-    page = (ROOT / "docs" / name).read_text(encoding="utf-8").replace("\\\n", " ")
+    page = (ROOT / "docs" / "guides" / name).read_text(encoding="utf-8").replace("\\\n", " ")
     return [shlex.split(line)[1:] for line in re.findall(r"^dptse .*$", page, re.MULTILINE)]
 
 
@@ -132,7 +132,7 @@ SMALL = {
 
 def test_the_page_on_own_data_has_commands_that_run(fifteen_minutes, monkeypatch):
     monkeypatch.chdir(fifteen_minutes)
-    commands = commands_of("own_data.md")
+    commands = commands_of("your-data.md")
     assert [words[0] for words in commands] == [
         "import", "fit", "evaluate", "train", "evaluate", "import"
     ]  # fmt: skip
@@ -152,7 +152,7 @@ def test_the_page_on_own_data_has_commands_that_run(fifteen_minutes, monkeypatch
 @pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
 def test_the_page_on_own_data_goes_on_to_a_policy(fifteen_minutes, monkeypatch):
     monkeypatch.chdir(fifteen_minutes)
-    first, *rest = commands_of("own_data.md")[:-1]
+    first, *rest = commands_of("your-data.md")[:-1]
     printed = run(*first[1:], "--output", "again")
     following = re.search(r"^next: dptse (evaluate .*)$", printed, re.MULTILINE)[1]
     if not Path("us-101").exists():
