@@ -8,7 +8,7 @@ training, and the learners that get further training seeds. Then all play test t
 every learner with the first of ``--training-seeds``, the best two of a setting with the others. The
 same command goes on after a kill. The report needs the rows and ``curves.parquet`` alone.
 
-dptse study policies --train 10 --training-seeds 0:5 --workers 2
+dptse study policies --train 1 --training-seeds 0:5 --workers 2
 dptse study policies --report
 """
 
@@ -93,15 +93,19 @@ class Traffic(NamedTuple):
 
 TRAFFIC = Traffic(*map(parse_seeds, ("0:128", "1000:1024", "2200:2264", "2200:2264")))
 LONG_TRAFFIC = Traffic(*map(parse_seeds, ("0:48", "1000:1008", "2200:2216", "2200:2208")))
-LONG_CHANGES: dict[str, dict[str, Any]] = {
-    **{name: {"validations": 12} for name, _ in LEARNERS.values()},
+CHANGES: dict[str, dict[str, Any]] = {
+    **{name: {"validations": 5} for name, _ in LEARNERS.values()},
+    PLACKETT_LUCE: {"n_envs": 64, "regression": {"batches": 250}, "swaps": {"episodes": 60}},
+}  # fmt: skip
+"""What differs from tuned settings, by algorithm, in trainings of one minute: validations and
+rounds that take a fair part of it."""
+LONG_CHANGES: dict[str, dict[str, Any]] = CHANGES | {
     PLACKETT_LUCE: {
-        "n_envs": 16, "regression": {"batch_size": 128},
-        "swaps": {"episodes": 60, "batch_size": 128},
+        "n_envs": 16, "regression": {"batches": 250, "batch_size": 128},
+        "swaps": {"episodes": 8, "batch_size": 128},
     },
 }  # fmt: skip
-"""Settings by algorithm for 120 segments: fewer validations, which take long, and fewer samples for
-Plackett-Luce, to which every segment is one."""
+"""The same for 120 segments, every one of which is a sample for Plackett-Luce."""
 
 
 class Setting(NamedTuple):
@@ -119,7 +123,7 @@ class Setting(NamedTuple):
     env: str
     keywords: Mapping[str, Any]
     traffic: Traffic = TRAFFIC
-    changes: Mapping[str, Mapping[str, Any]] = {}
+    changes: Mapping[str, Mapping[str, Any]] = CHANGES
 
 
 _ONE, _TWO = ({"estimator": "ekf", "bandwidth": bandwidth} for bandwidth in (1, 2))
