@@ -71,9 +71,9 @@ test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasiu
 test-ray: setup  ## Run the tests of Ray clusters on this machine, with killed workers and lost nodes.
 	$(BIN)/python -m pytest -m ray
 
-site: setup  ## Build the documentation site, warnings as errors; build/site.
+site: setup  ## Build the documentation site and check its links; build/site.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python docs/_site/build.py
 
 docs: setup  ## Write the notebook of the tutorial anew.
 	$(BIN)/python docs/_site/notebook.py

@@ -1,6 +1,10 @@
-"""Links of the documentation lead somewhere; a release is the same in all that state it."""
+"""Links of the pages beside the site lead somewhere; all files state the same release.
+
+The links of the site are checked where it is built, by ``docs/_site/links.py``.
+"""
 
 import re
+import runpy
 import tomllib
 from pathlib import Path
 
@@ -10,7 +14,7 @@ import dptse_env
 from hatch_build import for_package_page
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("results/*/*.md")]
+PAGES = sorted(ROOT.glob("*.md"))
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
 
@@ -40,6 +44,23 @@ def test_links_lead_somewhere(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A b: c\n[a](#a-b-c) [b](#no) [c](page.md#a-b-c) [d](no.md) `[e](code.md)`\n")
     assert list(broken(page)) == ["#no", "no.md"]
+
+
+def test_the_site_is_refused_with_dead_links_and_with_files_of_other_hosts(tmp_path):
+    (tmp_path / "page.html").write_text(
+        '<h1 id="ε">A</h1> <a href="#%CE%B5">a</a> <a href="#no">b</a> <img src="no.png">'
+        '<a href="https://far.example">c</a> <script src="https://far.example/c.js"></script>'
+    )
+    (tmp_path / "404.html").write_text('<a href="/page.html#ε">d</a> <a href="/no.html">e</a>')
+    (tmp_path / "a.css").write_text("a {b: url(https://far.example/d.woff)} c {d: url(e.png)}")
+    problems = runpy.run_path(str(ROOT / "docs" / "_site" / "links.py"))["problems"]
+    assert sorted(problems(tmp_path)) == [
+        "404.html: /no.html does not exist",
+        "a.css: fetches https://far.example/d.woff",
+        "page.html: #no is no anchor",
+        "page.html: fetches https://far.example/c.js",
+        "page.html: no.png does not exist",
+    ]
 
 
 PAGE = """![a road](docs/road.png) [`env`](a/env.py), [there](docs/a.md#b), [far](https://far.example).

@@ -75,9 +75,18 @@ def check(line):
 
 
 def parse(words):
-    if words not in (["--help"], ["--version"]):
+    if not {"--help", "--version"} & {*words}:
         arguments = importlib.import_module(MODULES[words[0]]).Args
         tyro.cli(arguments, args=words[1:])
+
+
+def test_the_example_that_the_help_of_a_command_begins_with_can_be_parsed():
+    for module in MODULES.values():
+        lines = [*commands(importlib.import_module(module).__doc__.split("\n\n")[1].strip())]
+        assert lines
+        for line in lines:
+            assert line.startswith("dptse ")
+            check(line)
 
 
 def test_a_command_with_an_unknown_option_would_be_noticed():

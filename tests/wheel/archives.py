@@ -26,8 +26,8 @@ FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}
 """Folders of a source archive."""
 BESIDE_THEM = {
     ".gitignore", "CHANGELOG.md", "CITATION.cff", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md",
-    "LICENSE", "Makefile", "README.md", "constraints.txt", "hatch_build.py", "mkdocs.yml",
-    "pyproject.toml",
+    "LICENSE", "Makefile", "README.md", "constraints.txt", "hatch_build.py",
+    "pyproject.toml", "zensical.toml",
 }  # fmt: skip
 IN_A_SOURCE_ARCHIVE = IN_A_WHEEL | {
     ".css", ".ipynb", ".md", ".npz", ".png", ".toml", ".yaml", ".yml"
