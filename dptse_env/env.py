@@ -116,8 +116,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     ``mu`` in ``privacy``.
 
     **Arguments** of ``gym.make``, with the defaults of ``PaperHighway-v0``. All are plain JSON, but
-    for parts of your own (a class or ``"package.module:Class"``). ``docs/reference/configuration.md`` has
-    every field of those that take a mapping.
+    for parts of your own (a class or ``"package.module:Class"``). `EnvConfig` names the classes of
+    those that take a mapping. ``docs/environment`` explains them, a page a noun.
 
     | argument             | default         | meaning                                             |
     | :--                  | :--             | :--                                                 |

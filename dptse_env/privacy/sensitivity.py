@@ -71,7 +71,8 @@ def paper_sensitivity(
     The differing vehicle passes each of `n_sensors` static sensors once in either record, at
     different times, and stays for `average_dwell` steps. While it does, the density there differs
     by one vehicle over the segment's length, and the speed by the slope of the equilibrium
-    relation (with exponent 1) times that. ``docs/privacy/proof.md`` lists the cases that this overlooks.
+    relation (with exponent 1) times that. ``docs/privacy/proof.md`` lists the cases that this
+    overlooks.
 
     Args:
         n_sensors: observed segments at a step: queried segments plus fixed sensors.

@@ -333,8 +333,8 @@ class Capped(GaussianRelease):
 
     The guarantee holds for any query policy. The centred flow [veh/h] is the sum of v - v_0 over
     the vehicles that count, per length, with v clipped to [0, 2 v_0]: it changes by at most v_0 / l
-    when a vehicle comes or goes. ``docs/privacy/proof.md`` has the proof. A vehicle's ledger has a budget
-    of C contributions at a price of 1 each, in each group of columns.
+    when a vehicle comes or goes. ``docs/privacy/proof.md`` has the proof. A vehicle's ledger has a
+    budget of C contributions at a price of 1 each, in each group of columns.
     """
 
     settings_type: ClassVar[type[PrivacySettings]] = CappedSettings

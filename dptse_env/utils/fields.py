@@ -2,7 +2,7 @@
 
 Keyword values of ``gym.make`` travel as JSON, so every configuration must be reachable from
 dictionaries, lists, strings and numbers. The annotation of a field declares its type and range,
-``Annotated[float, Interval(0, 1)]``: `checked_fields` enforces it, and ``docs/reference/configuration.md``
+``Annotated[float, Interval(0, 1)]``: `checked_fields` enforces it, and the reference of keywords
 shows it. An error is one line: ``<path> must be <allowed>, got <value>``.
 """
 
