@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
+from textwrap import fill
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -28,14 +29,19 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6
 PALE = "#a8cbe2"
 """Bars of what is compared with."""
 WIDTH = 7.2
-"""Of a figure [inches] whose texts of 8 points are read at 700 pixels."""
+"""Largest width of a figure [inches]: its texts of 8 points are read at 700 pixels."""
 INK, GREY, GRID_COLOUR = "#1b2a41", "#333333", "#e3e6ea"
 ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 700, 1000)
 
 
 def make_figure(width: float, height: float, dpi: int = 140) -> Figure:
-    """Return an empty figure [inches] that lays out its axes without overlaps."""
-    return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+    """Return an empty figure [inches] that lays out its axes without overlaps.
+
+    One that is too wide is made narrower, and up to a fifth lower.
+    """
+    share = min(WIDTH / width, 1.0)
+    size = (share * width, max(share, 0.8) * height)
+    return Figure(figsize=size, dpi=dpi, layout="constrained")
 
 
 def save_figure(figure: Figure, path: Path, title: str) -> None:
@@ -170,7 +176,7 @@ def _make_panels(
     figure = make_figure(WIDTH, 1.1 + height * len(rows), dpi=160)
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axis, panel in zip(axes, panels, strict=True):
-        axis.set_xlabel(panel, fontsize=9)
+        axis.set_xlabel(fill(panel, 72 // len(panels)), fontsize=9)
         add_frame(axis, "x")
     axes[0].set_yticks([-place for place in range(len(rows))], rows)
     return figure, axes
@@ -222,7 +228,7 @@ def draw_maps(
     )  # fmt: skip
     for k, panels in enumerate(columns):
         for axis, panel in zip(axes[:, k], panels, strict=True):
-            image = _draw_map(axis, panel)
+            image = _draw_map(axis, panel, len(columns))
             if not panel.is_flags:
                 densities = image
         axes[-1, k].set_xlabel("time [s]", fontsize=8)
@@ -236,9 +242,9 @@ def draw_maps(
     return figure
 
 
-def _draw_map(axis: Axes, panel: RoadMap) -> AxesImage:
+def _draw_map(axis: Axes, panel: RoadMap, n_columns: int) -> AxesImage:
     values = np.array(panel.seconds).T[panel.history.rows]
-    axis.set_title(panel.title, loc="left", fontsize=9, pad=3, color=INK)
+    axis.set_title(fill(panel.title, 88 // n_columns), loc="left", fontsize=9, pad=3, color=INK)
     axis.tick_params(labelsize=8)
     return axis.imshow(
         values,
