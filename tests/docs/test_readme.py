@@ -1,4 +1,4 @@
-"""The README, whose Python prints what stands below it, and whose commands train a policy that wins."""
+"""The README: its Python prints what stands below it, its commands train a policy that wins."""
 
 import contextlib
 import io
