@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo reproduce audit test test-slow mutants test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
+.PHONY: help setup docs site dist demo pictures reproduce audit test test-slow mutants test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -23,11 +23,15 @@ $(READY): pyproject.toml constraints.txt
 
 DEMO = --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}'
 
-demo: setup  ## Train a query policy with PPO for a minute and evaluate it beside the rules on unseen traffic; results/demo.
+demo: setup  ## Train a query policy for a minute and compare it with rules on other traffic; results/demo.
 	$(BIN)/dptse train $(DEMO) --minutes 1 --algorithm 'ppo {"validations": 8}' \
 		--traffic 0:48 --validation 1000:1016 --output results/demo/training
 	$(BIN)/dptse evaluate $(DEMO) --policies results/demo/training/best.safetensors \
+		--schedules random round-robin oldest-first stale-variance largest-density-variance speed-front \
 		--seeds 2000:2032 --reference speed-front --output results/demo --force
+
+pictures: demo  ## Draw the pictures of the pages anew; docs/images.
+	$(BIN)/python docs/_site/pictures.py
 
 reproduce: setup  ## Write the reports of all studies anew, after playing what their rows lack; results/.
 	$(BIN)/dptse study paper

@@ -1,4 +1,4 @@
-"""The README for a package page, which resolves no links and pictures of the repository."""
+"""The README for a package page, which resolves no links of the repository and plays no picture."""
 
 import re
 from pathlib import Path
@@ -37,6 +37,8 @@ def for_package_page(text: str, repository: str | None, tag: str) -> str:
         picture, words, target = found.groups()
         if repository is None:
             return "" if picture else words
+        if picture:
+            target = re.sub(r"\.gif$", ".png", target)  # the still beside a moving picture
         kind = "raw" if picture else "blob"
         return f"{picture}[{words}]({repository.rstrip('/')}/{kind}/{tag}/{target})"
 

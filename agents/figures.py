@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
+from textwrap import fill
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,18 +20,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.statistics import Interval
 from agents.tables import UnmeasuredError
-from dptse_env.rendering import DENSITY_MAP, QUERY_COLOUR, History
+from dptse_env.rendering import DENSITY_MAP, History
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import replacing
 
-COLOURS = ("#1b4f72", "#c1272d", "#5d8233", "#7d5ba6", "#b9770e")
-GRID_COLOUR = "#e3e6ea"
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666")
+"""Okabe and Ito's, which the colour-blind can tell apart, and a grey."""
+PALE = "#a8cbe2"
+"""Bars of what is compared with."""
+WIDTH = 7.2
+"""Largest width of a figure [inches]: its texts of 8 points are read at 700 pixels."""
+INK, GREY, GRID_COLOUR = "#1b2a41", "#333333", "#e3e6ea"
 ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 700, 1000)
 
 
 def make_figure(width: float, height: float, dpi: int = 140) -> Figure:
-    """Return an empty figure [inches] that lays out its axes without overlaps."""
-    return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+    """Return an empty figure [inches] that lays out its axes without overlaps.
+
+    One that is too wide is made narrower, and up to a fifth lower.
+    """
+    share = min(WIDTH / width, 1.0)
+    size = (share * width, max(share, 0.8) * height)
+    return Figure(figsize=size, dpi=dpi, layout="constrained")
 
 
 def save_figure(figure: Figure, path: Path, title: str) -> None:
@@ -95,11 +106,13 @@ def spread(intervals: Sequence[Interval]) -> FloatArray:
     return np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
 
 
-def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: str) -> None:
+def draw_dot(
+    axis: Axes, interval: Interval, place: float, colour: str, label: str, fmt: str = "o"
+) -> None:
     """Draw a mean with its interval at a height, and its value beside it."""
     axis.errorbar(
         [interval.mean], [place], xerr=spread([interval]), color=colour, label=label,
-        fmt="o", markersize=4, capsize=2.5, linewidth=1.2,
+        fmt=fmt, markersize=4, capsize=2.5, linewidth=1.2,
     )  # fmt: skip
     axis.annotate(
         f"{interval.mean:.1f}", (interval.high, place), color=colour,
@@ -119,12 +132,10 @@ def draw_errors(
         series: By colour, row and error, the same errors for all: intervals.
         log: Whether the errors stand on logarithmic axes.
     """
-    panels = list(next(each[row] for each in series.values() for row in rows if row in each))
-    colours = dict(zip(series, cycle(COLOURS), strict=False))
     most = max(sum(row in each for each in series.values()) for row in rows)
-    height = 1.6 + (0.18 + 0.12 * most) * len(rows)
-    figure = make_figure(2.4 + 2.6 * len(panels), height, dpi=120)
-    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    panels = list(next(each[row] for each in series.values() for row in rows if row in each))
+    figure, axes = _make_panels(rows, panels, 0.18 + 0.12 * most)
+    colours = dict(zip(series, cycle(COLOURS), strict=False))
     for axis, panel in zip(axes, panels, strict=True):
         for place, row in enumerate(rows):
             own = {name: each[row][panel] for name, each in series.items() if row in each}
@@ -134,12 +145,41 @@ def draw_errors(
         if log:
             axis.set_xscale("log")
             set_log_ticks(axis.xaxis, ERROR_TICKS)
-        axis.margins(x=0.12)
-        axis.set_xlabel(panel, fontsize=9)
-        add_frame(axis, "x")
-    axes[0].set_yticks([-place for place in range(len(rows))], rows)
+        axis.margins(x=0.2)
     add_legend(figure, axes[:1])
     return figure
+
+
+def draw_bars(errors: Mapping[str, Mapping[str, Interval]], lit: Collection[str]) -> Figure:
+    """Draw bars with 95 % intervals, a panel for each of some errors.
+
+    Args:
+        errors: By row, from top to bottom, and error, the same errors for all: intervals.
+        lit: Rows that stand out.
+    """
+    panels = list(next(iter(errors.values())))
+    figure, axes = _make_panels(list(errors), panels, 0.24)
+    for axis, panel in zip(axes, panels, strict=True):
+        for place, (row, own) in enumerate(errors.items()):
+            interval = own[panel]
+            colour = COLOURS[1] if row in lit else PALE
+            axis.barh(-place, interval.mean, height=0.72, color=colour)
+            draw_dot(axis, interval, -place, INK, "", fmt="none")
+        axis.set_xlim(0.0, 1.3 * max(own[panel].high for own in errors.values()))
+    return figure
+
+
+def _make_panels(
+    rows: Sequence[str], panels: Sequence[str], height: float
+) -> tuple[Figure, Sequence[Axes]]:
+    """Return a figure with a panel for each error, and rows of a height [inches]."""
+    figure = make_figure(WIDTH, 1.1 + height * len(rows), dpi=160)
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axis, panel in zip(axes, panels, strict=True):
+        axis.set_xlabel(fill(panel, 72 // len(panels)), fontsize=9)
+        add_frame(axis, "x")
+    axes[0].set_yticks([-place for place in range(len(rows))], rows)
+    return figure, axes
 
 
 @dataclass(frozen=True)
@@ -188,7 +228,7 @@ def draw_maps(
     )  # fmt: skip
     for k, panels in enumerate(columns):
         for axis, panel in zip(axes[:, k], panels, strict=True):
-            image = _draw_map(axis, panel)
+            image = _draw_map(axis, panel, len(columns))
             if not panel.is_flags:
                 densities = image
         axes[-1, k].set_xlabel("time [s]", fontsize=8)
@@ -202,9 +242,9 @@ def draw_maps(
     return figure
 
 
-def _draw_map(axis: Axes, panel: RoadMap) -> AxesImage:
+def _draw_map(axis: Axes, panel: RoadMap, n_columns: int) -> AxesImage:
     values = np.array(panel.seconds).T[panel.history.rows]
-    axis.set_title(panel.title, loc="left", fontsize=9, pad=3, color=QUERY_COLOUR)
+    axis.set_title(fill(panel.title, 88 // n_columns), loc="left", fontsize=9, pad=3, color=INK)
     axis.tick_params(labelsize=8)
     return axis.imshow(
         values,
@@ -221,9 +261,6 @@ def _draw_map(axis: Axes, panel: RoadMap) -> AxesImage:
         vmin=0.0,
         vmax=1.0 if panel.is_flags else panel.history.density_scale,
     )
-
-
-GREY = "#333333"
 
 
 class Look(NamedTuple):

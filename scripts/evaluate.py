@@ -19,7 +19,7 @@ from typing import Any, Literal
 import polars as pl
 
 from agents.environments import make_config, parse_env
-from agents.figures import RoadMap, draw_errors, draw_maps, estimate_map, save_figure
+from agents.figures import RoadMap, draw_bars, draw_errors, draw_maps, estimate_map, save_figure
 from agents.files import refuse_to_replace
 from agents.page import watch, write_page
 from agents.play import Cell
@@ -302,8 +302,11 @@ def main(args: Args) -> None:
             }
             for name, own in scores.items()
         }
-        rows_of_figure = list(next(iter(series.values())))
-        save_figure(draw_errors(rows_of_figure, series), folder / ERRORS, title)
+        first, *others = series.values()
+        names = {cell.labels["policy"]: cell.policy for cell in cells}
+        learned = [n for n in first if not isinstance(find_policy(names[n]), NamedSchedule)]
+        figure = draw_errors(list(first), series) if others else draw_bars(first, learned)
+        save_figure(figure, folder / ERRORS, title)
         draw_traffic(args, title, scores, cells)
         return write_markdown(title, scores, args.reference)
 

@@ -37,6 +37,14 @@ def broken(page):
             yield link
 
 
+def test_a_moving_picture_is_small_and_has_a_still_beside_it():
+    moving = list((ROOT / "docs" / "images").glob("*.gif"))
+    assert moving
+    for path in moving:
+        assert path.stat().st_size < 1_000_000
+        assert path.with_suffix(".png").is_file()
+
+
 @pytest.mark.skipif(not (ROOT / "results").is_dir(), reason="a source archive has no results")
 def test_links_lead_somewhere(tmp_path):
     found = {page.relative_to(ROOT).as_posix(): list(broken(page)) for page in PAGES}
@@ -63,7 +71,7 @@ def test_the_site_is_refused_with_dead_links_and_with_files_of_other_hosts(tmp_p
     ]
 
 
-PAGE = """![a road](docs/road.png) [`env`](a/env.py), [there](docs/a.md#b), [far](https://far.example).
+PAGE = """![a road](docs/road.gif) [`env`](a/env.py), [there](docs/a.md#b), [far](https://far.example).
 [below](#below)
 ```python
 tools["a"](b)

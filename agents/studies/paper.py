@@ -456,8 +456,8 @@ def draw_sweep(played: Played, field: str, metrics: Sequence[str], columns: int)
     for axis, panel in zip(figure.subplots(n_rows, columns).flat, panels, strict=True):
         metric, setting = panel
         (alone,) = curves_of(played, setting, Curve("open_loop", metric))
-        title = f"{setting}\n{error_label(metric)}, open loop: {alone.mean():.1f}"
-        axis.set_title(title, fontsize=9, loc="left")
+        lines = (*setting.split(", "), error_label(metric), f"open loop: {alone.mean():.1f}")
+        axis.set_title("\n".join(lines), fontsize=8, loc="left")
         for k, name in enumerate(ESTIMATORS[:-1]):
             (curve,) = curves_of(played, setting, Curve(name, metric, field))
             places = shifted(SWEEPS[field], 0.01 * (k - 2), log=field != "bandwidth")

@@ -1,13 +1,21 @@
 """Write the tutorial as a notebook: docs/tutorial.ipynb.
 
 python docs/_site/notebook.py
+
+Where `[project.urls]` of pyproject.toml has the Repository, the tutorial gets a link that opens the
+notebook in Colab; its first cell installs the wheel.
 """
 
 import json
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
+ROOT = Path(__file__).parents[2]
+LINK = "[tutorial.ipynb](tutorial.ipynb)"
+COLAB = "https://colab.research.google.com/github{}/blob/main/docs/tutorial.ipynb"
 TUTORIAL = Path(__file__).parents[1] / "tutorial.md"
 NOTEBOOK = TUTORIAL.with_suffix(".ipynb")
 BLOCK = re.compile(r"```(\w+)(?: title=\"([\w.]+)\")?\n(.*?)```\n?", re.DOTALL)
@@ -46,6 +54,22 @@ def _add(cells: list[dict[str, Any]], kind: str, text: str) -> None:
     cells.append({**cell, "source": text.strip("\n").splitlines(keepends=True)})
 
 
+def repository() -> str | None:
+    """Return the address of the repository, if there is one."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    address: str | None = project.get("urls", {}).get("Repository")
+    return address
+
+
+def with_colab(page: str, address: str | None) -> str:
+    """Return the tutorial with a link to Colab, or without one where there is no repository."""
+    plain = re.sub(r",\nor \[open it in Colab\]\(\S+\)", "", page)
+    if address is None:
+        return plain
+    place = COLAB.format(urlsplit(address).path.rstrip("/"))
+    return plain.replace(LINK, f"{LINK},\nor [open it in Colab]({place})")
+
+
 def notebook_text() -> str:
     """Return the notebook of the tutorial as text."""
     notebook = make_notebook(TUTORIAL.read_text(encoding="utf-8"))
@@ -53,5 +77,7 @@ def notebook_text() -> str:
 
 
 if __name__ == "__main__":
+    page = TUTORIAL.read_text(encoding="utf-8")
+    TUTORIAL.write_text(with_colab(page, repository()), encoding="utf-8")
     NOTEBOOK.write_text(notebook_text(), encoding="utf-8")
     print(f"wrote {NOTEBOOK}")

@@ -14,7 +14,7 @@ from agents.audit.attack import Queries, overheard
 from agents.audit.planner import public_plan
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from agents.environments import make_config
-from agents.figures import add_frame, make_figure, save_figure
+from agents.figures import COLOURS, WIDTH, add_frame, make_figure, save_figure
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.traffic import Record, RecordLibrary
@@ -24,9 +24,7 @@ PICTURE = Path(__file__).parents[1] / "images" / "two_worlds.png"
 VEHICLES = 180, 252  # of the record of traffic seed 0: both meet the queue behind the incident
 SHOWN = 185, 450  # seconds
 SEGMENT = 8  # where both wait
-COLOURS = "#0072b2", "#d55e00"  # Okabe and Ito's: the colour-blind can tell them apart
-LINES = [{"color": c, "ls": s, "lw": 1.8} for c, s in zip(COLOURS, ("-", "--"), strict=True)]
-GREY = "#9aa0a6"
+LINES = [{"color": c, "ls": s, "lw": 1.8} for c, s in zip(COLOURS, ("-", "--"), strict=False)]
 
 
 class Transcript(NamedTuple):
@@ -76,7 +74,7 @@ def play(config: EnvConfig, worlds: AdjacentWorlds) -> Transcript:
 
 def draw(config: EnvConfig, worlds: AdjacentWorlds, found: Transcript) -> Figure:
     """Draw both worlds above, and what is published and paid below."""
-    figure = make_figure(7.0, 6.2, dpi=160)
+    figure = make_figure(WIDTH, 6.2, dpi=160)
     (first, second), (published, ledger) = figure.subplots(2, 2, sharex=True)
     seconds = np.arange(1, found.square.size + 1)
     for world, axis in enumerate((first, second)):
@@ -95,13 +93,13 @@ def draw(config: EnvConfig, worlds: AdjacentWorlds, found: Transcript) -> Figure
     say(first, (320, 3.2), "dots: counted\nno dot: not queried,\nor budget spent", "black")
     published.plot(seconds, found.released, ".", color="black", ms=4)
     published.set_ylim(0, 45)
-    published.set_ylabel("vehicles", fontsize=9)
+    published.set_ylabel("count [veh]", fontsize=9)
     add_title(published, f"Published: noisy counts (segment {SEGMENT})")
     say(published, (192, 1.5), "dots: published\nlines: true, in either world", "black")
     ledger.plot(seconds, 100.0 * found.square, ":", color="black", lw=1.8)
     ledger.axhline(100.0, color="black", lw=0.8)
     ledger.set_ylim(0, 112)
-    ledger.set_ylabel("%", fontsize=9)
+    ledger.set_ylabel("paid [%]", fontsize=9)
     add_title(ledger, "Ledger: part of the budget that is paid")
     say(ledger, (190, 90), "trip of world 0", COLOURS[0])
     say(ledger, (357, 45), "trip of\nworld 1", COLOURS[1])
@@ -109,7 +107,7 @@ def draw(config: EnvConfig, worlds: AdjacentWorlds, found: Transcript) -> Figure
     for axis in figure.axes:
         add_frame(axis)
     for axis in (published, ledger):
-        axis.set_xlabel("second of the episode", fontsize=9)
+        axis.set_xlabel("time [s]", fontsize=9)
         axis.set_xlim(*SHOWN)
     return figure
 
@@ -119,7 +117,7 @@ def draw_others(axis: Axes, rest: Record, n_mainline: int) -> None:
     for vehicle in range(0, rest.n_vehicles, 5):
         trip = Trajectory.from_record(rest, vehicle)
         trip = trip.only(trip.segment < n_mainline)
-        axis.plot(trip.step, trip.segment, color=GREY, lw=0.5, alpha=0.6)
+        axis.plot(trip.step, trip.segment, color=COLOURS[-1], lw=0.5, alpha=0.4)
 
 
 def add_title(axis: Axes, text: str, colour: str = "black") -> None:

@@ -9,7 +9,16 @@ from PIL import Image
 from rich.console import Console
 
 from agents import terminal
-from agents.figures import RoadMap, draw_errors, draw_maps, estimate_map, save_figure
+from agents.figures import (
+    WIDTH,
+    RoadMap,
+    draw_bars,
+    draw_errors,
+    draw_maps,
+    estimate_map,
+    make_figure,
+    save_figure,
+)
 from agents.files import write_json
 from agents.page import watch, write_page
 from agents.play import Cell
@@ -98,6 +107,25 @@ def test_errors_of_every_policy_are_drawn_from_top_to_bottom():
         assert [text.get_text() for text in axis.texts] == [f"{interval.mean:.1f}"] * 3
         assert [text.xy[1] for text in axis.texts] == [0.15, -0.15, -1.0]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ekf", "ukf"]
+
+
+def test_bars_begin_at_zero_and_those_of_learned_policies_stand_out():
+    errors = {
+        name: {"density": Interval(mean, mean - 1.0, mean + 1.0, 3)}
+        for name, mean in (("mine", 8.0), ("paper", 10.0))
+    }
+    (axis,) = draw_bars(errors, ["mine"]).axes
+    mine, paper = axis.patches
+    assert (mine.get_width(), paper.get_width()) == (8.0, 10.0)
+    assert mine.get_facecolor() != paper.get_facecolor()
+    assert axis.get_xlim()[0] == 0.0
+    assert axis.get_xlim()[1] > 11.0
+    assert mine.get_y() > paper.get_y()
+
+
+def test_a_wide_figure_is_made_as_narrow_as_a_page():
+    assert make_figure(4.0, 3.0).get_size_inches().tolist() == [4.0, 3.0]
+    assert make_figure(2.0 * WIDTH, 3.0).get_size_inches().tolist() == [WIDTH, 0.8 * 3.0]
 
 
 def test_the_page_has_what_happened_and_needs_no_network(episode, tmp_path, monkeypatch):

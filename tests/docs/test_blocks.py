@@ -1,7 +1,7 @@
 """Every fenced block of the documentation: Python runs, commands and files are parsed.
 
-The tutorial and the pages on extending, on a road of one's own and on training have tests of their
-own that run them from top to bottom.
+The README, the tutorial and the pages on extending, on a road of one's own and on training have
+tests of their own that run them from top to bottom.
 A block under a comment ``<!-- not run: reason -->`` is compiled only.
 """
 
@@ -18,7 +18,13 @@ from tests.helpers import fast_and_slow
 
 from .blocks import BLOCKS, PAGES, ROOT
 
-RUN_ELSEWHERE = {"tutorial.md", "your-own-part.md", "your-road.md", "train-a-policy.md"}
+RUN_ELSEWHERE = {
+    "README.md",
+    "tutorial.md",
+    "your-own-part.md",
+    "your-road.md",
+    "train-a-policy.md",
+}
 RUN = {block.page for block in BLOCKS if block.language == "python"} - RUN_ELSEWHERE
 
 

@@ -18,6 +18,11 @@ NOTEBOOK = nbformat.read(DOCS / "tutorial.ipynb", as_version=4)
 def test_the_notebook_is_the_tutorial():
     code = runpy.run_path(str(DOCS / "_site" / "notebook.py"))
     assert code["NOTEBOOK"].read_text(encoding="utf-8") == code["notebook_text"]()
+    page = (DOCS / "tutorial.md").read_text(encoding="utf-8")
+    assert code["with_colab"](page, code["repository"]()) == page
+    there = code["with_colab"](page, "https://forge.example/a/b/")
+    assert "/github/a/b/blob/main/docs/tutorial.ipynb)" in there
+    assert code["with_colab"](there, None) == code["with_colab"](page, None)
     shown = [cell.source for cell in NOTEBOOK.cells if cell.cell_type == "code"]
     assert len(shown) == len(blocks_of(DOCS / "tutorial.md"))
     for text in shown:
@@ -39,7 +44,7 @@ def test_the_notebook_runs_in_a_kernel(tmp_path, monkeypatch):
     text = str([cell.outputs for cell in cells if cell.cell_type == "code"])
     assert "(5, 0.05)-differential privacy" in text
     assert "mean error 0." in text
-    assert "it asks segments [" in text
+    assert "the policy queries segment " in text
     assert "error:" not in text
     assert (tmp_path / "results/learned/page.html").is_file()
     assert (tmp_path / "results/learned/space_time.png").is_file()

@@ -1,0 +1,169 @@
+"""Draw an episode as a moving picture, and one second of it: docs/images/episode.gif and .png.
+
+A policy that ships with the package queries two of fifteen segments a second, under ``paced``. An
+incident stops the traffic on one of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch
+from PIL import Image
+
+from agents.environments import make_config
+from agents.figures import COLOURS, INK, PALE, add_frame
+from agents.page import watch
+from agents.play import Cell
+from dptse_env.rendering import History
+from dptse_env.traffic.scenario import draw_scenario
+from dptse_env.utils.files import replacing
+
+CELL = Cell(
+    "dptse_env:dptse/PrivateHighway-v1", "paced-roads", {"bandwidth": 2, "estimator": "recurrent"}
+)
+SEED, STILL = 2009, 284
+SECONDS = range(120, 500, 4)
+FRAME = 110  # milliseconds
+SHADES = "YlOrRd"  # pale is empty, dark red a jam
+NOW, EARLIER, IDLE = COLOURS[0], PALE, "#eef1f5"  # when a segment was queried
+TRUTH, QUERIES, ESTIMATE = 2.2, 1.25, 0.0  # heights of the strips
+STRIPS = {
+    TRUTH: ("traffic", "as it is"),
+    QUERIES: ("queries", "two a second"),
+    ESTIMATE: ("estimate", "from noisy sums"),
+}
+LARGEST = 200.0  # density at the end of the colours [veh/km]
+LEFT, RIGHT = 0.145, 0.905  # of the road and the curve, as shares of the width
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An episode and its incident.
+
+    Attributes:
+        history: The episode.
+        segment: Where the incident is.
+        start: When it blocks the road [s].
+        end: When it stops to [s].
+    """
+
+    history: History
+    segment: int
+    start: float
+    end: float
+
+
+def play() -> Scene:
+    """Play the episode."""
+    corridor = make_config(CELL.env, dict(CELL.keywords)).corridor
+    (incident,) = draw_scenario(corridor, SEED).incidents
+    start, end, _ = incident.phases[0]
+    return Scene(watch("", CELL, SEED).history, incident.segment, start, end)
+
+
+def add_strip(axes: Axes, bottom: float, height: float, n: int) -> PatchCollection:
+    """Draw a road of n cells."""
+    cells = [
+        FancyBboxPatch((i + 0.06, bottom), 0.88, height, boxstyle="round,pad=0,rounding_size=0.1")
+        for i in range(n)
+    ]
+    strip = PatchCollection(cells, edgecolors="none")
+    axes.add_collection(strip)
+    return strip
+
+
+class Film:
+    """The figure, laid out once, and its frames."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Lay out the strips and the curve."""
+        self.scene = scene
+        n = len(scene.history.lengths)
+        self.figure = Figure(figsize=(7.6, 3.9), dpi=100)
+        self.canvas = FigureCanvasAgg(self.figure)
+        road = self.figure.add_axes((LEFT, 0.36, RIGHT - LEFT, 0.63), xlim=(0, n), ylim=(-0.1, 3.9))
+        road.axis("off")
+        self.strips = {}
+        style = {"color": INK, "va": "center"}
+        for bottom, (name, more) in STRIPS.items():
+            height = 0.55 if bottom == QUERIES else 0.8
+            self.strips[bottom] = add_strip(road, bottom, height, n)
+            middle = bottom + height / 2
+            road.text(-0.15, middle + 0.16, name, ha="right", weight="bold", size=11, **style)
+            road.text(-0.15, middle - 0.2, more, ha="right", size=8, color=COLOURS[-1], va="center")
+        road.text(0.06, 3.7, "driving direction  →", size=9, **style)
+        self.clock = road.text(n - 0.06, 3.7, "", ha="right", size=11, **style)
+        self.incident = road.text(
+            scene.segment + 0.5, 3.4, "incident\n▼", ha="center", va="center",
+            size=9, weight="bold", color=COLOURS[1],
+        )  # fmt: skip
+        self._add_bar()
+        curve = self.figure.add_axes((LEFT, 0.125, RIGHT - LEFT, 0.185))
+        (self.curve,) = curve.plot([], [], color=INK, lw=1.5)
+        (self.point,) = curve.plot([], [], "o", color=INK, ms=5, clip_on=False)
+        self.error = curve.text(
+            1, 1.02, "", size=10, weight="bold", ha="right", color=INK, transform=curve.transAxes
+        )
+        curve.set(xlim=(SECONDS[0], SECONDS[-1]), ylim=(0, 30), yticks=(0, 10, 20, 30))
+        curve.set_xlabel("time [s]", size=9)
+        curve.set_ylabel("density error\n[veh/km]", size=9)
+        add_frame(curve, "y")
+
+    def _add_bar(self) -> None:
+        shades = ScalarMappable(Normalize(0, LARGEST), SHADES)
+        place = self.figure.add_axes((RIGHT + 0.012, 0.37, 0.016, 0.45))
+        bar = self.figure.colorbar(shades, place, extend="max", ticks=range(0, 201, 50))
+        bar.set_label("density [veh/km]", size=9)
+        bar.ax.tick_params(labelsize=8)
+
+    def draw(self, second: int) -> Image.Image:
+        """Return the picture of a second."""
+        history, scene = self.scene.history, self.scene
+        for bottom, series in ((TRUTH, history.truth), (ESTIMATE, history.estimate)):
+            self.strips[bottom].set_facecolor(colormaps[SHADES](series[second] / LARGEST))
+        now = history.queried[second]
+        before = np.any(history.queried[second - SECONDS.step + 1 : second], axis=0)
+        self.strips[QUERIES].set_facecolor(
+            [NOW if a else EARLIER if b else IDLE for a, b in zip(now, before, strict=True)]
+        )
+        self.incident.set_visible(scene.start <= second < scene.end)
+        self.clock.set_text(f"second {second}")
+        errors = history.rmse[: second + 1]
+        self.curve.set_data(range(SECONDS[0], second + 1), errors[SECONDS[0] :])
+        self.point.set_data([second], errors[-1:])
+        self.error.set_text(f"error now: {errors[-1]:.0f} veh/km")
+        self.canvas.draw()
+        return Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3].copy())
+
+
+def save_moving(frames: list[Image.Image], path: Path) -> None:
+    """Save frames as a GIF with one palette."""
+    palette = frames[len(frames) // 2].quantize(200, Image.Quantize.MAXCOVERAGE)
+    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    with replacing(path) as temporary:
+        first.save(
+            temporary, format="GIF", save_all=True, append_images=others, duration=FRAME, loop=0
+        )
+
+
+def main() -> None:
+    """Write the moving picture and the still."""
+    folder = Path(__file__).parents[1] / "images"
+    film = Film(play())
+    save_moving([film.draw(second) for second in SECONDS], folder / "episode.gif")
+    with replacing(folder / "episode.png") as temporary:
+        film.draw(STILL).save(temporary, format="PNG", optimize=True)
+
+
+if __name__ == "__main__":
+    main()
