@@ -57,7 +57,7 @@ def draw_estimators() -> Figure:
     """
     found = {
         "PrivateHighway-v1\n(simulated)": on_private_highway(rows_of("estimators")),
-        "ten other roads\n(simulated)": on_other_roads(rows_of("roads")),
+        "fourteen other roads\n(simulated)": on_other_roads(rows_of("roads")),
         "US-101\n(measured)": on_measured_road(),
     }
     figure = make_figure(7.0, 3.6, dpi=160)
