@@ -25,6 +25,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from agents.figures import (
+    COLOURS,
     GREY,
     LABELS,
     Look,
@@ -330,18 +331,15 @@ def setting_table(rows: pl.DataFrame, curves: pl.DataFrame, setting: str) -> str
     return grid("policy", sorted(errors, key=lambda each: errors[each].mean), columns, entry)
 
 
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b9770e", "#56b4e9", "#7d5ba6")
-
-
 def _panels(titles: Iterable[str], label: str = "", **options: Any) -> tuple[Figure, list[Axes]]:
     """Return a figure of up to eight panels with titles; ``label`` is that of their left edge."""
-    figure, named = make_figure(11.0, 5.8, dpi=120), list(titles)
-    axes = list(figure.subplots(2, 4, **options).ravel())
+    figure, named = make_figure(7.2, 8.8), list(titles)
+    axes = list(figure.subplots(4, 2, **options).ravel())
     for axis in axes[len(named) :]:
         axis.remove()
     for axis, title in zip(axes, named, strict=False):
         axis.set_title(title, fontsize=9)
-    for axis in axes[::4]:
+    for axis in axes[::2]:
         axis.set_ylabel(label, fontsize=8)
     return figure, axes[: len(named)]
 
@@ -357,7 +355,7 @@ def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
             continue
         for rule, error in shown.items():
             draw_rule(axis, rule, error)
-        for learner, colour in zip(LEARNERS, _COLOURS, strict=False):
+        for learner, colour in zip(LEARNERS, COLOURS, strict=True):
             own = curves.filter(setting=name, policy=learner).sort("training_seed", "seconds")
             for _, each in own.group_by("training_seed", maintain_order=True):
                 minutes = each["seconds"] / 60.0
@@ -365,7 +363,7 @@ def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
         # What is not trained yet may err far more than any rule.
         axis.set_ylim(top=1.03 * max(shown.values()))
         axis.set_xlabel("minutes", fontsize=8)
-    save_figure(finish_figure(figure, columns=7), path, "Errors on validation traffic")
+    save_figure(finish_figure(figure, columns=4), path, "Errors on validation traffic")
 
 
 def draw_below(rows: pl.DataFrame, path: Path) -> None:
@@ -378,7 +376,7 @@ def draw_below(rows: pl.DataFrame, path: Path) -> None:
                 below = compared(rows, name, policy, BELOW)
             except UnmeasuredError:
                 continue
-            colour = _COLOURS[0] if policy in LEARNERS else GREY
+            colour = COLOURS[0] if policy in LEARNERS else GREY
             draw_dot(axis, below, -place, colour, "learners" if policy in LEARNERS else "oracles")
         axis.axvline(0.0, color=GREY, linewidth=0.8)
         axis.margins(x=0.2)
@@ -431,10 +429,10 @@ WORLDS = (
     World("long", "capped", "recurrent"),
 )
 LOOKS = {
-    "rule": Look("#0072b2", "o"),
-    ORACLE: Look("#666666", "^", ":"),
-    GAIN: Look("#333333", "v", "--"),
-    LEARNED: Look("#d55e00", "s"),
+    "rule": Look(COLOURS[0], "o"),
+    ORACLE: Look(COLOURS[-1], "^", ":"),
+    GAIN: Look(GREY, "v", "--"),
+    LEARNED: Look(COLOURS[1], "s"),
 }
 
 
