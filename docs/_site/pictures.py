@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-SCRIPTS = ("episode.py", "two_worlds.py", "environment.py")
+SCRIPTS = ("episode.py", "two_worlds.py", "environment.py", "guides.py")
 BARS = FOLDER.parents[1] / "results" / "demo" / "schedules.png"
 
 if __name__ == "__main__":

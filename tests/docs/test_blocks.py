@@ -1,7 +1,7 @@
 """Every fenced block of the documentation: Python runs, commands and files are parsed.
 
-The README, the tutorial and the pages on extending, on a road of one's own and on training have
-tests of their own that run them from top to bottom.
+The README, the tutorial and the guides with commands have tests of their own that run them from top
+to bottom.
 A block under a comment ``<!-- not run: reason -->`` is compiled only.
 """
 
@@ -9,6 +9,7 @@ import importlib
 import re
 import shlex
 import tomllib
+from xml.etree import ElementTree
 
 import pytest
 import tyro
@@ -16,25 +17,22 @@ import tyro
 from scripts.dptse import MODULES
 from tests.helpers import fast_and_slow
 
-from .blocks import BLOCKS, PAGES, ROOT
+from .blocks import BLOCKS, PAGES, ROOT, commands
+from .test_guides import GUIDES
 
-RUN_ELSEWHERE = {
-    "README.md",
-    "tutorial.md",
-    "your-own-part.md",
-    "your-road.md",
-    "train-a-policy.md",
-}
+RUN_ELSEWHERE = {"README.md", "tutorial.md", "your-own-part.md", *GUIDES}
 RUN = {block.page for block in BLOCKS if block.language == "python"} - RUN_ELSEWHERE
 
 
 def test_blocks_are_of_languages_that_are_tested_here_and_can_be_parsed():
     for block in BLOCKS:
-        assert block.language in {"", "python", "bash", "sh", "toml"}, block
+        assert block.language in {"", "python", "bash", "sh", "toml", "xml"}, block
         if block.language == "python":
             compile(block.text, str(block), "exec")
         if block.language == "toml":
             assert tomllib.loads(block.text), block
+        if block.language == "xml":
+            ElementTree.fromstring(block.text)
         if block.language in ("bash", "sh"):
             for line in commands(block.text):
                 check(line)
@@ -49,20 +47,6 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatc
             if "RecordVideo" in block.text:
                 pytest.importorskip("moviepy", reason="the extra video is not installed")
             exec(compile(block.text, str(block), "exec"), names)
-
-
-def commands(text):
-    """Yield the command lines of a block; quotes may hold several lines."""
-    pending = ""
-    for line in text.replace("\\\n", " ").splitlines():
-        pending = f"{pending} {line.strip()}".strip()
-        try:
-            shlex.split(pending, comments=True)
-        except ValueError:  # a quote is open
-            continue
-        yield pending
-        pending = ""
-    assert not pending, pending
 
 
 def check(line):

@@ -9,8 +9,7 @@ import pytest
 
 from tests.scripts.commands import run_command
 
-from .blocks import ROOT, blocks_of
-from .test_blocks import commands
+from .blocks import ROOT, blocks_of, commands
 
 BLOCKS = blocks_of(ROOT / "README.md")
 

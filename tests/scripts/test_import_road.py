@@ -102,7 +102,7 @@ def fifteen_minutes(tmp_path_factory):
     """A folder with the files of the page on data, and 15 minutes of simulated NGSIM rows."""
     folder = tmp_path_factory.mktemp("page")
     page = (ROOT / "docs" / "guides" / "your-data.md").read_text(encoding="utf-8")
-    for name, content in re.findall(r"```toml\n# (\S+)\n(.*?)```", page, re.DOTALL):
+    for name, content in re.findall(r'```toml title="(\S+)"\n(.*?)```', page, re.DOTALL):
         (folder / name).write_text(content)
     flows = Demand(((0.0, 4000.0), (300.0, 6500.0), (600.0, 4500.0)), (400.0,))
     road = read_corridor(folder / "road.toml")
@@ -146,6 +146,16 @@ def test_the_page_on_own_data_has_commands_that_run(fifteen_minutes, monkeypatch
     assert re.search(
         r"^next: dptse evaluate .*us-101/road.toml.* --seeds 2000:2001$", printed, re.M
     )
+
+
+def test_the_page_on_own_data_imports_a_field(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    waves = 30.0 + 10.0 * np.sin(np.add.outer(np.arange(40), np.arange(200)) / 5.0)
+    np.savetxt("density.txt", waves)
+    np.savetxt("speed.txt", 110.0 - waves)
+    printed = run(*commands_of("your-data.md")[-1][1:])
+    assert "training: 1 window(s), traffic seeds 0\n" in printed
+    assert read_corridor("ring-road/road.toml").n_mainline == 6
 
 
 @pytest.mark.slow

@@ -1,0 +1,130 @@
+"""Draw the pictures of the guides: docs/images/road.png, network.png and frame.png.
+
+python docs/_site/guides.py
+
+Both roads come from the files that the guides show; the network needs the extra corridors.
+"""
+
+import re
+import subprocess
+import tempfile
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import sumolib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+
+from agents.figures import COLOURS, GRID_COLOUR, WIDTH, make_figure, save_figure
+from agents.fitting.page import draw_road
+from dptse_env.importers.network import Files, Layout, find_layout
+from dptse_env.schedules import make_schedule
+from dptse_env.traffic import read_corridor
+from dptse_env.utils.arrays import FloatArray
+
+DOCS = Path(__file__).parents[1]
+FILE = re.compile(r'^```\w+ title="([\w.-]+)"\n(.*?)^```', re.DOTALL | re.MULTILINE)
+PATH = "west", "east"  # as in the guide
+SEGMENT_LENGTH = 150.0  # [m]; as in the guide
+MAINLINE, RAMP, BOUNDARY = (COLOURS[0], COLOURS[5]), COLOURS[1], COLOURS[6]
+
+
+def write_files(guide: str, folder: Path) -> None:
+    """Write the files that a guide shows to a folder."""
+    for name, text in FILE.findall((DOCS / "guides" / guide).read_text(encoding="utf-8")):
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def draw_network(net: Path, layout: Layout) -> Figure:
+    """Draw the lanes of a network in grey, and over them its segments with their numbers."""
+    network = sumolib.net.readNet(str(net), withInternal=True)
+    figure = make_figure(WIDTH, 2.6, dpi=160)
+    axis = figure.subplots()
+    for edge in network.getEdges(withInternal=True):
+        for lane in edge.getLanes():
+            axis.plot(
+                *np.array(lane.getShape()).T, color=GRID_COLOUR, lw=2.5, solid_capstyle="butt"
+            )
+    n, n_ramps = len(layout.lengths), len(layout.names)
+    colours = [MAINLINE[number % 2] for number in range(n)] + [RAMP] * n_ramps
+    colours += [BOUNDARY] * (2 + n_ramps)
+    for number, (stretches, colour) in enumerate(zip(layout.columns, colours, strict=True)):
+        lines = [points_of(network.getEdge(edge), low, high) for edge, low, high in stretches]
+        for line in lines:
+            axis.plot(*line.T, color=colour, lw=4.0, solid_capstyle="butt")
+        if number < n + n_ramps:
+            add_number(axis, np.concatenate(lines), str(number), above=number < n)
+    handles = [
+        axis.plot([], [], color=colour, lw=4.0, label=label)[0]
+        for colour, label in (
+            (MAINLINE[0], "segments of the mainline"), (RAMP, "segments of ramps"),
+            (BOUNDARY, "boundary segments"),
+        )
+    ]  # fmt: skip
+    axis.legend(handles=handles, loc="upper left", frameon=False, fontsize=9)
+    axis.annotate(
+        "", (0.95, 0.22), (0.8, 0.16), xycoords="axes fraction", textcoords="axes fraction",
+        arrowprops={"arrowstyle": "->", "color": "black"},
+    )  # fmt: skip
+    axis.annotate("traffic", (0.87, 0.08), xycoords="axes fraction", ha="center", fontsize=9)
+    axis.set_aspect("equal")
+    axis.set_xlabel("x [m]", fontsize=9)
+    axis.set_ylabel("y [m]", fontsize=9)
+    axis.tick_params(labelsize=8)
+    axis.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def points_of(edge: sumolib.net.edge.Edge, start: float, end: float) -> FloatArray:
+    """Return the points of an edge between two positions [m] on its longest lane, shape (n, 2)."""
+    shape = np.array(edge.getShape(), dtype=np.float64)[:, :2]
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shape, axis=0).T))])
+    length = max(lane.getLength() for lane in edge.getLanes())
+    low, high = (min(place / length, 1.0) * way[-1] for place in (start, end))
+    places = np.concatenate([[low], way[(way > low) & (way < high)], [high]])
+    return np.column_stack([np.interp(places, way, axis) for axis in shape.T])
+
+
+def add_number(axis: Axes, line: FloatArray, number: str, above: bool) -> None:
+    """Write the number of a segment above its middle, or below."""
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    x, y = (float(np.interp(way[-1] / 2.0, way, part)) for part in line.T)
+    axis.annotate(
+        number, (x, y), xytext=(0, 9 if above else -10), textcoords="offset points",
+        ha="center", va="center", fontsize=9,
+    )  # fmt: skip
+
+
+def draw_frame(path: Path, seconds: int = 420) -> None:
+    """Save what an environment renders when some seconds of an episode are over."""
+    env = gym.make("dptse_env:dptse/PrivateHighway-v1", render_mode="rgb_array")
+    schedule, state = make_schedule("speed-front", env), None
+    observation, _ = env.reset(seed=0, options={"traffic_seed": 0})
+    for _ in range(seconds):
+        action, state = schedule.predict(observation, state)
+        observation, *_ = env.step(action)
+    imsave(path, np.asarray(env.render()))
+
+
+def draw_guides() -> None:
+    """Draw all of them."""
+    images = DOCS / "images"
+    draw_frame(images / "frame.png")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_files("your-road.md", folder)
+        road = draw_road(read_corridor(folder / "my-road.toml"))
+        road.set_size_inches(WIDTH, 2.4)
+        save_figure(road, images / "road.png", "")
+        write_files("your-network.md", folder)
+        words = "--node-files town.nod.xml --edge-files town.edg.xml --output-file town.net.xml"
+        subprocess.run(["netconvert", *words.split()], cwd=folder, check=True, capture_output=True)
+        files = Files(folder / "town.net.xml", (folder / "town.rou.xml",))
+        layout = find_layout(files, PATH, SEGMENT_LENGTH, between=True)
+        save_figure(draw_network(files.net, layout), images / "network.png", "")
+
+
+if __name__ == "__main__":
+    draw_guides()
