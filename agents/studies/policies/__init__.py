@@ -92,7 +92,7 @@ class Traffic(NamedTuple):
     gain: tuple[int, ...]
 
 
-TRAFFIC = Traffic(*map(parse_seeds, ("0:128", "1000:1024", "2200:2264", "2200:2264")))
+TRAFFIC = Traffic(*map(parse_seeds, ("0:128", "1000:1024", "2200:2232", "2200:2216")))
 LONG_TRAFFIC = Traffic(*map(parse_seeds, ("0:48", "1000:1008", "2200:2216", "2200:2208")))
 CHANGES: dict[str, dict[str, Any]] = {
     **{name: {"validations": 5} for name, _ in LEARNERS.values()},
