@@ -93,20 +93,22 @@ class Traffic(NamedTuple):
 
 
 TRAFFIC = Traffic(*map(parse_seeds, ("0:128", "1000:1024", "2200:2232", "2200:2216")))
-LONG_TRAFFIC = Traffic(*map(parse_seeds, ("0:48", "1000:1008", "2200:2216", "2200:2208")))
+LONG_TRAFFIC = Traffic(*map(parse_seeds, ("0:48", "1000:1004", "2200:2216", "2200:2204")))
 CHANGES: dict[str, dict[str, Any]] = {
     **{name: {"validations": 5} for name, _ in LEARNERS.values()},
     PLACKETT_LUCE: {"n_envs": 64, "regression": {"batches": 250}, "swaps": {"episodes": 60}},
 }  # fmt: skip
 """What differs from tuned settings, by algorithm, in trainings of one minute: validations and
 rounds that take a fair part of it."""
-LONG_CHANGES: dict[str, dict[str, Any]] = CHANGES | {
+LONG_CHANGES: dict[str, dict[str, Any]] = {
+    **{name: {"validations": 2} for name, _ in LEARNERS.values()},
     PLACKETT_LUCE: {
         "n_envs": 16, "regression": {"batches": 250, "batch_size": 128},
         "swaps": {"episodes": 8, "batch_size": 128},
     },
 }  # fmt: skip
-"""The same for 120 segments, every one of which is a sample for Plackett-Luce."""
+"""The same for 120 segments, which take long to validate, and every one of which is a sample for
+Plackett-Luce."""
 
 
 class Setting(NamedTuple):

@@ -183,7 +183,7 @@ def test_what_a_training_starts_from_has_half_of_its_time():
     whole = plan_of(Training("long", "plackett-luce", 3), Path(), 10.0)
     assert (whole.seed, whole.minutes, whole.algorithm.n_envs) == (3, 10.0, 16)
     assert plan_of(Training("long", START, 3), Path(), 10.0).minutes == 5.0
-    assert plan_of(Training("long", "ppo-road", 0), Path(), 10.0).algorithm.validations == 5
+    assert plan_of(Training("long", "ppo-road", 0), Path(), 10.0).algorithm.validations == 2
 
 
 def test_a_time_that_is_none_is_refused_and_nothing_written(tmp_path):
