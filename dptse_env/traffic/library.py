@@ -13,6 +13,7 @@ it has reached a certain age.
 
 import contextlib
 import logging
+import multiprocessing
 import os
 import tempfile
 import threading
@@ -43,7 +44,16 @@ MEMORY = 2**28
 LEFTOVER_AGE = 6 * 3600.0
 """Age [s] at which a hidden file is considered abandoned. Writing takes a second."""
 
+RECORDED = 2000.0
+"""Length of road [km] times duration [s] that SUMO records in a second, roughly."""
+
+LONG = 3.0
+"""Time of a recording [s] from which on it is announced."""
+
 logger = logging.getLogger(__name__)
+
+_said: set[str] = set()
+"""Digests of the roads whose recording this process has announced."""
 
 
 def default_path() -> Path:
@@ -172,9 +182,11 @@ class RecordLibrary:
             _prepare(paths[seeds[0]].parent)
         except OSError as error:
             raise RecordingError.from_cause(corridor, seeds[0], str(error)) from error
-        logger.info("%s: recording %d seed(s) into %s", corridor.name, len(seeds), self.path)
+        if not progress:
+            _say_recording(corridor, len(seeds) / workers)
         sources = {seed: _source(corridor, seed) for seed in seeds}
-        with tqdm(total=len(seeds), desc=corridor.name, unit="record", disable=not progress) as bar:
+        about = {"desc": f"recording {corridor.name}", "unit": "seed"}
+        with tqdm(total=len(seeds), disable=not progress, **about) as bar:
             record_seeds(corridor, paths, sources, workers, bar.update)
 
     @contextlib.contextmanager
@@ -215,6 +227,20 @@ def open_library(records: Records) -> RecordLibrary:
         records,
     )
     return RecordLibrary(records)
+
+
+def _say_recording(corridor: Corridor, n_seeds: float) -> None:
+    """Say that traffic is recorded: once for a road if it takes long, and otherwise to the log."""
+    seconds = n_seeds * corridor.duration * sum(corridor.segment_lengths) / RECORDED
+    is_said = seconds < LONG or corridor.digest in _said or multiprocessing.parent_process()
+    if not is_said:
+        _said.add(corridor.digest)
+    logger.log(
+        logging.INFO if is_said else logging.WARNING,
+        "Recording traffic of %s with SUMO, once for each traffic seed: about %.0f s",
+        corridor.name,
+        seconds,
+    )
 
 
 def _source(corridor: Corridor, seed: int) -> dict[str, object]:

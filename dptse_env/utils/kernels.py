@@ -19,6 +19,7 @@ import math
 import os
 import pickle
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import cache, cached_property
@@ -44,6 +45,12 @@ from dptse_env.utils.files import write_atomically
 logger = logging.getLogger(__name__)
 
 _PACKAGE = __name__.partition(".")[0]
+
+_SLOW = f"{_PACKAGE}.estimators."
+"""Modules of kernels that take long to compile; one of the others takes a second at most."""
+
+_is_said = threading.Event()
+"""Whether this process, or the one that it has waited for, has said that it compiles."""
 
 _OPTIONS: dict[str, Any] = {
     "error_model": "numpy", "nogil": True, "nopython": True, "no_cfunc_wrapper": True,
@@ -185,10 +192,10 @@ class _Kept(NullCache):
         path = self._path(signature, context.codegen())
         loaded = _loaded(path, context)
         if loaded is None:
-            name = self._name.removeprefix(f"{_PACKAGE}.")
-            logger.warning("Compiling %s (kept in %s)", name, self._folder)
             self._waits.enter_context(_alone(self._folder / f"{self._name}.lock"))
             loaded = _loaded(path, context)
+            if loaded is None and self._name.startswith(_SLOW):
+                _say_compiling()
         return loaded
 
     def save_overload(self, signature: tuple[Any, ...], compiled: Any) -> None:
@@ -230,7 +237,11 @@ def _alone(path: Path) -> Iterator[None]:
     lock = FileLock(path, thread_local=False)
     with contextlib.suppress(OSError, NotImplementedError, Timeout):
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=LONGEST_WAIT)
+        try:
+            lock.acquire(timeout=0.0)
+        except Timeout:
+            _is_said.set()  # by the other one
+            lock.acquire(timeout=LONGEST_WAIT)
     try:
         yield
     finally:
@@ -260,6 +271,13 @@ def _remove_unused(folder: Path) -> None:
         with contextlib.suppress(OSError):  # another user's, or removed meanwhile
             if time.time() - path.stat().st_mtime > KEPT_FOR:
                 path.unlink()
+
+
+def _say_compiling() -> None:
+    """Say once what takes long now, and how long."""
+    if not _is_said.is_set():
+        _is_said.set()
+        logger.warning("Compiling the estimator, once on this machine: about 10 s, the MHE 25 s")
 
 
 @cache

@@ -5,6 +5,7 @@ import logging
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -12,6 +13,7 @@ from filelock import FileLock
 from numba.core import config
 from numba.core.errors import TypingError
 
+from dptse_env.utils import kernels
 from dptse_env.utils.kernels import KEPT_FOR, fingerprint
 
 MODULE = """
@@ -92,17 +94,13 @@ def test_equal_code_of_another_module_has_another_fingerprint(load):
     assert fingerprint(load(name="elsewhere").second.py_func) != before
 
 
-def test_a_kernel_is_kept_on_disk_and_compiled_anew_when_a_part_changes(load, kept, caplog):
+def test_a_kernel_is_kept_on_disk_and_compiled_anew_when_a_part_changes(load, kept):
     def fresh(text=MODULE):
         run = load(text).run
         return run(1.5), sum(run.stats.cache_hits.values())
 
-    with caplog.at_level(logging.WARNING, logger=LOG):
-        assert fresh() == (3.0, 0)
-        assert "Compiling kernels_of_a_test.run (kept in" in caplog.text
-        caplog.clear()
-        assert fresh() == (3.0, 1)
-        assert not caplog.messages
+    assert fresh() == (3.0, 0)
+    assert fresh() == (3.0, 1)
     (file,) = kept.glob("*.machine-code")
     file.write_bytes(file.read_bytes()[:100])  # damaged
     assert fresh() == (3.0, 0)
@@ -168,7 +166,31 @@ print("done", flush=True)
 """
 
 
-def test_a_kernel_that_another_process_compiles_is_waited_for(load, kept):
+@pytest.fixture
+def said(monkeypatch, caplog):
+    """Return what is said of compiling, where all kernels are slow."""
+    monkeypatch.setattr(kernels, "_SLOW", "")
+    monkeypatch.setattr(kernels, "_is_said", threading.Event())
+    caplog.set_level(logging.WARNING, logger=LOG)
+    return caplog
+
+
+def test_compiling_what_is_slow_is_said_once(load, kept, said, monkeypatch):
+    module = load()
+    module.run(1.5)
+    module.second(module.Pair(1.5, 2.5))
+    assert said.messages == [
+        "Compiling the estimator, once on this machine: about 10 s, the MHE 25 s"
+    ]
+    said.clear()
+    kernels._is_said.clear()
+    load().run(1.5)  # which is kept
+    monkeypatch.setattr(kernels, "_SLOW", "other")
+    load(MODULE.replace("2.0", "4.0")).run(1.5)  # which is quick
+    assert not said.messages
+
+
+def test_a_kernel_that_another_process_compiles_is_waited_for(load, kept, said):
     kept.mkdir()
     command = [sys.executable, "-c", HOLD, str(kept / "kernels_of_a_test.run.lock")]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
@@ -176,6 +198,10 @@ def test_a_kernel_that_another_process_compiles_is_waited_for(load, kept):
         began = time.monotonic()
         assert load().run(1.5) == 3.0
         assert time.monotonic() - began > 1.0
+    assert not said.messages  # by the other process, and so would be the next kernel
+    module = load()
+    module.second(module.Pair(1.5, 2.5))
+    assert not said.messages
 
 
 def test_the_turn_ends_where_compiling_fails(load, kept):
