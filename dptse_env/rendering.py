@@ -1,4 +1,4 @@
-"""An episode as a picture over space and time: true density, its estimate, queries and error."""
+"""An episode as a picture: truth and estimate along the road now, and over space and time."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from dptse_env.process import QueryProcess
 
 DENSITY_MAP = "viridis"
-ERROR_COLOUR = "#c1272d"
-QUERY_COLOUR = "#1b2a41"
-NO_QUERY_COLOUR = "#eef1f5"
+TRUTH_COLOUR = "#000000"
+ESTIMATE_COLOUR = "#0072b2"
+QUERY_COLOUR = "#d55e00"
+NO_QUERY_COLOUR = "#f2f4f7"
 LIMIT_STEP = 10.0
 """Step in which the axis of errors grows [veh/km]."""
 SMOOTH_FROM = 500
@@ -40,6 +41,7 @@ class History:
         estimate: Estimated mainline densities [veh/km], an array (n_mainline,) per second.
         queried: Segments that a query covered, flags (n_mainline,) per second.
         rmse: Density error over the mainline [veh/km], a number per second.
+        title: Road, estimator and bandwidth in words.
     """
 
     episode: int
@@ -50,13 +52,22 @@ class History:
     estimate: list[FloatArray] = field(default_factory=list)
     queried: list[BoolArray] = field(default_factory=list)
     rmse: list[float] = field(default_factory=list)
+    title: str = ""
 
     @classmethod
     def empty(cls, process: QueryProcess, episode: int = 0) -> History:
         """Return the history of an episode of ``process`` that is to begin."""
-        corridor = process.config.corridor
+        config, corridor = process.config, process.config.corridor
         lengths = corridor.segment_lengths[: corridor.n_mainline]
-        return cls(episode, process.config.horizon_steps, lengths, corridor.density_scale)
+        known = config.estimator
+        estimator = known if isinstance(known, str) else getattr(known, "__name__", "your own")
+        is_sums = config.bandwidth_unit == "sums"
+        unit = "sums" if is_sums else f"of {len(lengths)} segments"
+        title = (
+            f"{corridor.name}, estimator {estimator}, queries {config.bandwidth} {unit} a second"
+        )
+        scale = corridor.density_scale
+        return cls(episode, config.horizon_steps, lengths, scale, title=title)
 
     @classmethod
     def from_process(cls, process: QueryProcess, episode: int = 0) -> History:
@@ -88,7 +99,10 @@ class History:
 
 
 class Picture:
-    """Four panels over one time axis, laid out once and filled as an episode goes on."""
+    """Five panels, laid out once and filled as an episode goes on.
+
+    The first shows the present second along the road, the others have one time axis.
+    """
 
     def __init__(self, history: History) -> None:
         """Lay out the panels for episodes of the road and length of ``history``."""
@@ -97,9 +111,11 @@ class Picture:
         from matplotlib.colors import ListedColormap  # noqa: PLC0415
         from matplotlib.figure import Figure  # noqa: PLC0415
 
-        figure = Figure(figsize=(7.2, 6.4), dpi=100, layout="constrained")
+        figure = Figure(figsize=(7.2, 8.0), dpi=100, layout="constrained")
         self._canvas: Any = FigureCanvasAgg(figure)
-        axes = figure.subplots(4, 1, sharex=True, gridspec_kw={"height_ratios": [3, 3, 3, 1.3]})
+        axes = figure.subplots(5, 1, gridspec_kw={"height_ratios": [2.6, 3, 3, 2.6, 1.6]})
+        figure.suptitle(history.title, x=0.01, ha="left", fontsize=10)
+        self._draw_profile(axes[0], history)
         self._shape = (len(history.rows), history.horizon + 1)
         extent = (-0.5, history.horizon + 0.5, 0.0, history.road_length)
         shades = {"cmap": DENSITY_MAP, "vmin": 0.0, "vmax": history.density_scale}
@@ -110,28 +126,55 @@ class Picture:
         self._maps = [
             axis.imshow(blank, extent=extent, interpolation=interpolation, **place, **colours)
             for axis, colours, interpolation in zip(
-                axes[:3], (shades, shades, flags), ("nearest", "nearest", smooth), strict=True
+                axes[1:4], (shades, shades, flags), ("nearest", "nearest", smooth), strict=True
             )
         ]
-        (self._error,) = axes[3].plot([], [], color=ERROR_COLOUR, linewidth=1.0)
-        for axis, name in zip(axes, ("true density", "estimate", "queried", "error"), strict=True):
-            axis.set_title(name, loc="left", fontsize=9, pad=3)
+        (self._error,) = axes[4].plot([], [], color=ESTIMATE_COLOUR, linewidth=1.2)
+        axes[4].set_xlim(extent[:2])
+        axes[4].set_ylabel("[veh/km]", fontsize=8)
+        axes[4].set_xlabel("time [s]", fontsize=8)
+        titles = ("", "True density", "Estimated density", "Queried segments", "")
+        for axis, title in zip(axes, titles, strict=True):
+            axis.set_title(title, loc="left", fontsize=9, pad=3)
             axis.tick_params(labelsize=8)
-        for axis in axes[:3]:
-            axis.set_ylabel("road [km]", fontsize=8)
-        axes[3].set_ylabel("RMSE\n[veh/km]", fontsize=8)
-        axes[3].set_xlabel("time [s]", fontsize=8)
+        for axis in axes[1:4]:
+            axis.set_ylabel("position [km]", fontsize=8)
+            axis.tick_params(labelbottom=False)
+        # Titles that change from second to second.
+        self._now = axes[0].set_title(" ", loc="left", fontsize=9, pad=3)
+        self._rmse = axes[4].set_title(" ", loc="left", fontsize=9, pad=3)
         bar = figure.colorbar(
-            self._maps[0], ax=axes.tolist(), fraction=0.03, pad=0.02, extend="max"
-        )
+            self._maps[0], ax=axes.tolist(), fraction=0.03, pad=0.02, extend="max",
+            shrink=0.44, anchor=(0.0, 0.62),
+        )  # fmt: skip
         bar.set_label("density [veh/km]", fontsize=8)
         bar.ax.tick_params(labelsize=8)
         # The layout stays as it is: working it out takes most of the time of a drawing.
         figure.canvas.draw()
         figure.set_layout_engine("none")
-        for artist in (*self._maps, self._error):
+        self._moving = (
+            self._marks, self._true, self._estimated, *self._maps, self._error, self._now,
+            self._rmse,
+        )  # fmt: skip
+        for artist in self._moving:
             artist.set_animated(True)  # left out of the background
         self._limit, self._background = 0.0, None
+
+    def _draw_profile(self, axis: Any, history: History) -> None:
+        """Lay out the panel along the road, and name its curves."""
+        edges = np.concatenate(([0.0], np.cumsum(history.lengths)))
+        zeros, top = np.zeros(len(history.lengths)), history.density_scale
+        look = {"edges": edges, "linewidth": 1.6, "baseline": None}
+        self._marks = axis.stairs(
+            zeros, edges, fill=True, color=QUERY_COLOUR, alpha=0.35, label="queried now"
+        )
+        self._true = axis.stairs(zeros, color=TRUTH_COLOUR, label="true density", **look)
+        self._estimated = axis.stairs(zeros, color=ESTIMATE_COLOUR, label="estimate", **look)
+        axis.set(xlim=(0.0, edges[-1]), ylim=(0.0, top))
+        axis.set_xlabel("position along the road [km]", fontsize=8)
+        axis.set_ylabel("[veh/km]", fontsize=8)
+        place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderaxespad": 0.0}
+        axis.legend(ncols=3, frameon=False, fontsize=8, **place)
 
     def draw(self, history: History) -> NDArray[np.uint8]:
         """Return the picture of ``history`` as RGB, shape (height, width, 3)."""
@@ -140,13 +183,21 @@ class Picture:
             values = np.full(self._shape, np.nan)
             values[:, : len(series)] = np.transpose(series)[history.rows]
             image.set_data(values)
+        self._marks.set_data(history.queried[-1] * history.density_scale)
+        self._true.set_data(history.truth[-1])
+        self._estimated.set_data(history.estimate[-1])
         self._error.set_data(range(len(history.rmse)), history.rmse)
+        self._now.set_text(f"Density in second {len(history.truth) - 1} of {history.horizon}")
+        self._rmse.set_text(
+            f"Error of the estimate (RMSE along the road), now {history.rmse[-1]:.1f} veh/km"
+        )
         self._draw_background(LIMIT_STEP * np.ceil(max(history.rmse) / LIMIT_STEP + 0.05))
         self._canvas.restore_region(self._background)
-        for artist in (*self._maps, self._error):
+        for artist in self._moving:
             artist.axes.draw_artist(artist)
-            for spine in artist.axes.spines.values():
-                artist.axes.draw_artist(spine)
+        for axis in {artist.axes: None for artist in self._moving}:
+            for spine in axis.spines.values():
+                axis.draw_artist(spine)
         return np.array(self._canvas.buffer_rgba())[..., :3]
 
     def _draw_background(self, limit: float) -> None:
@@ -224,6 +275,7 @@ class Window:
         Raises:
             MissingExtraError: pygame is not installed.
         """
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         with needed_for("render_mode='human'"):
             import pygame  # noqa: PLC0415
         self._pygame: Any = pygame
