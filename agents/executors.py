@@ -8,6 +8,7 @@ worker waits for one.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import subprocess
 import sys
@@ -110,10 +111,18 @@ class LocalProcesses(ThreadPoolExecutor):
         """Return the processes, new ones where one has died."""
         return loky.get_reusable_executor(
             self.workers,
-            initializer=follow_parent,
+            initializer=_begin,
             initargs=(os.getpid(),),
             env={"OMP_NUM_THREADS": "1"},
         )
+
+
+def _begin(parent: int) -> None:
+    """Begin a local process: it follows its parent, and logs on lines of their own."""
+    follow_parent(parent)
+    # In a terminal a bar of the parent stands in the line.
+    start = "\r\033[K" if sys.stderr.isatty() else ""
+    logging.basicConfig(format=f"{start}%(message)s")
 
 
 class RayCluster(Executor):

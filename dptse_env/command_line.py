@@ -38,3 +38,6 @@ def main() -> None:
     except MissingExtraError as problem:
         print(f"error: {problem}", file=sys.stderr)
         raise SystemExit(1) from problem
+    except KeyboardInterrupt:  # while it loads
+        print("\ninterrupted before it began", file=sys.stderr)
+        raise SystemExit(130) from None

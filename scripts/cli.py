@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from agents.environments import parse_env, preset_of, quietly
 from agents.executors import AnyExecutor, ExecutorError, ExecutorName, make_executor
@@ -111,6 +112,7 @@ def run(
     *,
     program: str | None = None,
     words: Sequence[str] | None = None,
+    resumes: bool = True,
 ) -> None:
     """Parse the command line into ``arguments`` and call ``main`` with them.
 
@@ -124,14 +126,15 @@ def run(
         description: Text for ``--help``: a sentence, and an example in a paragraph of its own.
         program: Name of the program in its help; that of the file if None.
         words: The command line; that of the process if None.
+        resumes: Whether the program goes on from what an interrupted run has done.
     """
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
+    logging.basicConfig(format="%(message)s")
     config = (tyro.conf.FlagCreatePairsOff,)
     try:
         given = tyro.cli(
             arguments, prog=program, args=words, description=description, config=config
         )
-        with warnings_told_once():
+        with logging_redirect_tqdm(), warnings_told_once():
             main(given)
     except BrokenPipeError:  # the reader of a pipe has seen enough, as head does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -140,7 +143,8 @@ def run(
         print(f"error: {_in_words(problem)}", file=sys.stderr)
         raise SystemExit(2 if isinstance(problem, BAD_INPUT) else 1) from problem
     except KeyboardInterrupt:
-        print("interrupted: the same command goes on from what is finished", file=sys.stderr)
+        goes_on = "goes on from what is done" if resumes else "begins anew"
+        print(f"\ninterrupted: the same command {goes_on}", file=sys.stderr)
         raise SystemExit(130) from None
 
 
@@ -156,7 +160,7 @@ def warnings_told_once() -> Iterator[None]:
         text = str(message)
         if text not in told:
             told.add(text)
-            logging.getLogger("dptse").warning("%s", text)
+            logging.getLogger("dptse").warning("warning: %s", text)
 
     warnings.showwarning = tell
     try:

@@ -11,28 +11,33 @@ from scripts.cli import run
 
 GROUPS = {
     "try": {
-        "info": "Print versions, machine and caches, as a bug report needs them.",
-        "evaluate": "Evaluate query schedules and policies on the same traffic and noise.",
+        "evaluate": "compare schedules and policies on the same traffic",
+        "info": "print versions and caches for a bug report",
     },
     "train": {
-        "train": "Train a query policy.",
-        "train-estimator": "Train a recurrent network as an estimator.",
+        "train": "train a query policy",
+        "train-estimator": "train a network as an estimator",
+        "tune": "tune the settings of estimators",
+    },
+    "compare": {
+        "suite": "score a policy in the query suite",
+        "replay-field": "compare estimators on a measured field",
     },
     "bring your own": {
-        "policy": "Import a model of stable-baselines3 as a saved policy.",
-        "import": "Import recorded trajectories, a SUMO network or a measured field as a road.",
-        "record": "Record traffic with SUMO, so that environments only replay it.",
-        "fit": "Fit parameters, estimator and query rule to a road.",
-        "tune": "Tune the estimators' settings on training traffic.",
+        "import": "import trajectories, a SUMO network or a field",
+        "record": "record traffic with SUMO ahead of time",
+        "fit": "fit parameters, estimator and rule to a road",
+        "policy": "import a model of stable-baselines3",
     },
-    "judge": {
-        "suite": "Score a policy in the cells of the query suite, and write its card.",
-        "study": "Play a study, and report on its rows.",
-        "audit": "Attack the privacy of an environment.",
-        "replay-field": "Replay a measured field of density and speed with the estimators.",
+    "study": {
+        "study": "run a study and write its report",
+        "audit": "attack the privacy of an environment",
     },
 }
 """Commands by what a person wants. Each is a module of this folder with ``Args`` and ``main``."""
+
+ANEW = ("audit", "import", "info", "policy", "replay-field")
+"""Commands that begin anew after an interruption."""
 
 MODULES = {name: f"scripts.{name.replace('-', '_')}" for group in GROUPS.values() for name in group}
 MODULES["import"] = "scripts.import_road"
@@ -47,7 +52,8 @@ def main(words: Sequence[str]) -> None:
         print(f"dptse {dptse_env.__version__}")
     elif name in MODULES:
         module = importlib.import_module(MODULES[name])
-        run(module.main, module.Args, module.__doc__, program=f"dptse {name}", words=rest)
+        about = {"program": f"dptse {name}", "words": rest, "resumes": name not in ANEW}
+        run(module.main, module.Args, module.__doc__, **about)
     else:
         known = ", ".join(MODULES)
         print(f"error: there is no command {name!r}, there are {known}", file=sys.stderr)
@@ -56,15 +62,10 @@ def main(words: Sequence[str]) -> None:
 
 def overview() -> str:
     """Return the help page: the commands in their groups."""
-    lines = [
-        "usage: dptse COMMAND ...",
-        "",
-        "Choose which connected vehicles to query when estimating traffic under differential "
-        "privacy.",
-    ]
+    lines = ["usage: dptse COMMAND [OPTIONS]"]
     for group, commands in GROUPS.items():
-        lines += ["", f"{group}:"]
-        lines += [f"  {name:<16} {meaning}" for name, meaning in commands.items()]
+        first, *others = (f"{name:<16} {meaning}" for name, meaning in commands.items())
+        lines += ["", f"{group:<16}{first}", *(f"{'':<16}{other}" for other in others)]
     return "\n".join([*lines, "", "dptse COMMAND --help begins with an example that runs."])
 
 

@@ -86,8 +86,11 @@ def test_the_example_of_the_help_runs_as_it_is_printed(name, tmp_path, monkeypat
 def test_the_overview_has_every_command_and_so_has_the_page():
     page = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
     overview = run_command("--help").stdout
+    lines = overview.splitlines()
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 80
     for name in MODULES:
-        assert f"\n  {name} " in overview
+        assert re.search(rf"^.{{16}}{name} ", overview, re.MULTILINE)
         assert f"| `{name}" in page
     assert run_command().stdout == overview
     assert run_command("--version").stdout == f"dptse {dptse_env.__version__}\n"
@@ -160,7 +163,7 @@ def test_the_status_says_what_happened(problem, status, said, monkeypatch):
     monkeypatch.setattr(info, "collect", collect)
     done = run_command("info")
     assert (done.returncode, done.stdout) == (status, "")
-    (line,) = done.stderr.splitlines()
+    (line,) = done.stderr.strip().splitlines()
     assert line.startswith(said)
 
 
