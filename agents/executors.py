@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
     ThreadPoolExecutor,
@@ -23,13 +24,14 @@ from concurrent.futures import (
 )
 from functools import partial
 from itertools import islice
+from threading import Lock
 from typing import Any, Literal, TypeVar
 
 import loky
 from tqdm import tqdm
 
 from dptse_env.command_line import TOOLS
-from dptse_env.traffic.recording import follow_parent
+from dptse_env.traffic.recording import follow_parent, uninterrupted
 from dptse_env.utils.fields import integer
 from dptse_env.utils.registry import needed_for
 
@@ -40,6 +42,12 @@ ExecutorName = Literal["local", "ray"]
 
 RETRIES = 3
 """Further attempts at a task whose worker or node dies. An error of the task itself is final."""
+
+IDLE = 10.0
+"""Time after which a local process without a task ends [s]."""
+
+LONGEST_WAIT = 0.5
+"""Longest wait for results [s]: Ctrl-C ends one where another thread is told of it."""
 
 ANSWER_SECONDS = 20.0
 """Longest time for a cluster to say that it works [s]; `ray.init` would try for minutes."""
@@ -81,7 +89,8 @@ class LocalProcesses(ThreadPoolExecutor):
         """Check the number."""
         self.workers = integer("workers", workers, 1)
         self.ahead = 2 * workers
-        self._is_cancelled = False
+        self._is_cancelled, self._lock = False, Lock()
+        self._pool: loky.ProcessPoolExecutor | None = None
         super().__init__(self.ahead)
 
     def submit(self, fn: Callable[..., ResultT], /, *args: Any, **kwargs: Any) -> Future[ResultT]:
@@ -90,16 +99,25 @@ class LocalProcesses(ThreadPoolExecutor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes; with ``cancel_futures`` without waiting for what they run."""
-        self._is_cancelled = cancel_futures
         # What waits must not begin once processes are gone, and what runs needs them to its end.
         super().shutdown(wait and not cancel_futures, cancel_futures=cancel_futures)
-        self._processes().shutdown(wait=wait, kill_workers=cancel_futures)
+        with self._lock:
+            self._is_cancelled = cancel_futures
+            if self._pool is not None:
+                self._pool.shutdown(wait=wait, kill_workers=cancel_futures)
 
     def _run(self, call: Callable[[], ResultT]) -> ResultT:
         for _ in range(RETRIES + 1):
+            with self._lock:
+                pool = self._started()
             try:
-                result: ResultT = self._processes().submit(call).result()
+                with uninterrupted():
+                    future = pool.submit(call)
+                result: ResultT = future.result()
             except BrokenExecutor as problem:
+                with self._lock:
+                    if self._pool is pool:
+                        self._pool = None
                 if self._is_cancelled:
                     raise
                 lost = problem
@@ -107,14 +125,23 @@ class LocalProcesses(ThreadPoolExecutor):
                 return result
         raise ExecutorError(_lost(type(lost).__name__)) from lost
 
-    def _processes(self) -> Any:
-        """Return the processes, new ones where one has died."""
-        return loky.get_reusable_executor(
-            self.workers,
-            initializer=_begin,
-            initargs=(os.getpid(),),
-            env={"OMP_NUM_THREADS": "1"},
-        )
+    def _started(self) -> loky.ProcessPoolExecutor:
+        """Return the processes, new ones where one has died.
+
+        Raises:
+            CancelledError: They were ended.
+        """
+        if self._is_cancelled:
+            raise CancelledError
+        if self._pool is None:
+            self._pool = loky.ProcessPoolExecutor(
+                self.workers,
+                timeout=IDLE,
+                initializer=_begin,
+                initargs=(os.getpid(),),
+                env={"OMP_NUM_THREADS": "1"},
+            )
+        return self._pool
 
 
 def _begin(parent: int) -> None:
@@ -298,7 +325,7 @@ def run_shown(
                     running[executor.submit(work, task)] = task
                 if not running:
                     return
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                for future in wait(running, LONGEST_WAIT, FIRST_COMPLETED).done:
                     task = running.pop(future)
                     take(task, future.result())
                     shown.update(size(task))

@@ -120,7 +120,10 @@ def shown(folder: Path) -> Iterator[dict[str, Any]]:
     """
     errors: dict[str, str] = {}
     with tqdm(
-        total=100, desc="training", unit="%", bar_format="{l_bar}{bar}| {elapsed}{postfix}"
+        total=100,
+        desc="training",
+        unit="%",
+        bar_format="{l_bar}{bar}| {elapsed}<{remaining}{postfix}",
     ) as bar:
 
         def add(row: Row) -> None:
@@ -128,7 +131,10 @@ def shown(folder: Path) -> Iterator[dict[str, Any]]:
             errors.update(validation=f"{1000 * least(row):.1f}", **{rule: f"{1000 * error:.1f}"})
 
         def progress(fraction: float, stage: str) -> None:
-            bar.n = round(100 * fraction)
+            done = round(100 * fraction)
+            if not bar.n:  # what was done before says nothing of the pace
+                bar.initial = done
+            bar.n = done
             bar.set_postfix({**errors, **({"now": stage} if stage else {})})
 
         yield {"watchers": (add,), "progress": progress}

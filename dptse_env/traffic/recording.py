@@ -112,7 +112,8 @@ def _record_until_death(
                 # No more than there are workers: all of them are in progress.
                 for seed in islice(waiting, n_workers - len(running)):
                     task = corridor, seed, paths[seed], dict(sources[seed])
-                    running[pool.submit(_record, *task)] = seed
+                    with uninterrupted():
+                        running[pool.submit(_record, *task)] = seed
             except BrokenProcessPool as error:
                 cause = _cause(error)
             if not running:
@@ -148,6 +149,19 @@ def _worker_processes(n_workers: int) -> Iterator[ProcessPoolExecutor]:
             yield pool
     finally:
         this.daemon = was_daemon
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Start processes in the body that leave interrupts to this one from the first moment on."""
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def follow_parent(parent: int, folder: str | None = None) -> None:

@@ -1,5 +1,6 @@
 import operator
 import os
+import signal
 import sys
 import time
 
@@ -44,6 +45,24 @@ def test_a_result_is_handed_over_before_the_next_task_begins():
 
     run_shown(ThisProcess(), work, [1, 2], lambda task, _: seen.append(("taken", task)))
     assert seen == [("begun", 1), ("taken", 1), ("begun", 2), ("taken", 2)]
+
+
+def place(number):
+    time.sleep(0.1)
+    return os.getpid()
+
+
+def interrupted(number):
+    os.kill(os.getpid(), signal.SIGINT)
+    return number
+
+
+def test_there_are_as_many_processes_as_asked_for_and_they_leave_interrupts_to_this_one():
+    executor = LocalProcesses(2)
+    places = set(run(executor, place, range(8)))
+    assert len(places) <= 2
+    assert os.getpid() not in places
+    assert run(executor, interrupted, range(2)) == [0, 1]
 
 
 def dies(number):
