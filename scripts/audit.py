@@ -54,7 +54,7 @@ class Args(Environment, Machines):
 
 
 def main(args: Args) -> None:
-    """Attack, and leave table and file."""
+    """Attack, and write table and file."""
     # Everything is checked before anything is recorded.
     integer("runs", args.runs, 2)
     integer("rounds", args.rounds, 0)

@@ -11,7 +11,7 @@ from scripts.cli import run
 
 GROUPS = {
     "try": {
-        "evaluate": "compare schedules and policies on the same traffic",
+        "evaluate": "compare schedules and policies on traffic",
         "info": "print versions and caches for a bug report",
     },
     "train": {

@@ -1,7 +1,7 @@
-r"""Evaluate query schedules and policies on the same traffic and noise.
+r"""Compare query schedules and policies on the same traffic and noise.
 
-dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --schedules paper round-robin \
-    --seeds 2000:2004
+dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --seeds 2000:2004 \
+    --schedules paper round-robin
 
 The error is minus 1,000 times the reward. Differences are paired by traffic and noise.
 """
@@ -79,7 +79,7 @@ class Args(Environment, Machines):
     output: Path = Path("results/evaluation")
     """Folder for tables, rows and figures."""
     html: bool = False
-    """Write an interactive page, too, page.html."""
+    """Also write an interactive page, page.html."""
     force: bool = False
     """Replace the files of an earlier evaluation."""
     json: bool = False

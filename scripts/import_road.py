@@ -43,8 +43,8 @@ SHARES: Shares = (0.6, 0.2, 0.2)
 class Trajectories(Environment):
     r"""Import recorded trajectories as records of a road.
 
-    dptse import trajectories --files points.csv --format table --output my-data \
-        --columns time=t vehicle=id x=s speed=v \
+    dptse import trajectories --files points.csv --format table \
+        --output my-data --columns time=t vehicle=id x=s speed=v \
         --env 'dptse_env:dptse/PaperHighway-v0 {"corridor": "road.toml"}'
 
     The folder has the road, road.toml, which an environment takes as its corridor, the records and
@@ -116,8 +116,8 @@ class Field:
     r"""Import a measured field of density and speed, or flow.
 
     dptse import field --density density.txt --speed speed.txt \
-        --cell 0.1 --interval 5 --name my-field --segments 6 --lanes 3 --speed-limit 100 \
-        --duration 90 --output my-field
+        --cell 0.1 --interval 5 --name my-field --segments 6 --lanes 3 \
+        --speed-limit 100 --duration 90 --output my-field
 
     A field has no vehicles: the release models paper and corrected work on it, those with a
     guarantee need the vehicles and say so.

@@ -8,16 +8,19 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+import os
 import platform
 import sys
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import dptse_env
 from dptse_env.privacy import DELTAS, over_trips
-from dptse_env.registration import ENVIRONMENTS
 from dptse_env.traffic import RecordLibrary
+from dptse_env.traffic.library import CACHE_VARIABLE
+from dptse_env.utils.kernels import default_folder
 from dptse_env.utils.threads import n_cores
 
 PACKAGES = (
@@ -26,6 +29,9 @@ PACKAGES = (
     "tqdm", "torch", "stable-baselines3", "sb3-contrib", "optuna", "plotly", "polars", "loky",
     "rich", "tyro", "ray", "filelock", "moviepy", "pygame", "tomlkit",
 )  # fmt: skip
+
+VARIABLES = (CACHE_VARIABLE, "NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT", "OMP_NUM_THREADS", "SUMO_HOME")
+"""Environment variables that change what the package does."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +54,7 @@ def _code_digest() -> str:
 
 def collect() -> dict[str, Any]:
     """Return what a bug report needs, as plain JSON."""
-    library = RecordLibrary()
-    records = [path for path in library.path.glob("records-*/*/*") if path.name[0] != "."]
+    records, kernels = RecordLibrary().path, default_folder()
     return {
         "dptse-env": dptse_env.__version__,
         "digest": _code_digest(),
@@ -58,9 +63,16 @@ def collect() -> dict[str, Any]:
         "platform": platform.platform(),
         "cores": n_cores(),
         "packages": {name: installed(name) for name in PACKAGES},
-        "records": {"folder": str(library.path), "number": len(records)},
-        "environments": list(ENVIRONMENTS),
+        "records": _content(records, "records-*/*/[!.]*"),
+        "kernels": _content(kernels, "*.machine-code"),
+        "variables": {name: os.environ[name] for name in VARIABLES if name in os.environ},
     }
+
+
+def _content(folder: Path, pattern: str) -> dict[str, Any]:
+    """Return folder, number and size of the files that a pattern fits."""
+    sizes = [path.stat().st_size for path in folder.glob(pattern)]
+    return {"folder": str(folder), "files": len(sizes), "megabytes": round(sum(sizes) / 1e6, 1)}
 
 
 def installed(package: str) -> str | None:
@@ -80,14 +92,20 @@ def main(args: Args) -> None:
     if args.mu is not None:
         _print_trips(found)
         return
-    packages = found.pop("packages")
-    records, ids = found.pop("records"), found.pop("environments")
-    for name, value in found.items():
-        print(f"{name:<18} {value}")
-    print(f"{'records':<18} {records['number']} in {records['folder']}")
-    print(f"{'environments':<18} {', '.join(ids)}")
-    for name, version in packages.items():
-        print(f"{name:<18} {version or 'not installed'}")
+    packages = found["packages"]
+    lacking = [name for name, version in packages.items() if version is None]
+    print(f"dptse-env {found['dptse-env']} (code {found['digest']}) in {found['folder']}")
+    print(f"Python {found['python']}, {found['platform']}, {found['cores']} cores")
+    for text in (
+        ", ".join(f"{name}=={version}" for name, version in packages.items() if version),
+        f"not installed: {', '.join(lacking) or 'none'}",
+    ):
+        print(textwrap.fill(text, 79, break_on_hyphens=False))
+    for cache in ("records", "kernels"):
+        has = found[cache]
+        print(f"{cache}: {has['files']} files, {has['megabytes']} MB in {has['folder']}")
+    for name, value in found["variables"].items():
+        print(f"{name}={value}")
 
 
 def _print_trips(account: dict[int, dict[str, float]]) -> None:

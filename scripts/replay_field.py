@@ -1,7 +1,7 @@
 r"""Replay a measured field of density and speed with the estimators.
 
-dptse replay-field --density density.txt --speed speed.txt --cell 0.1 --interval 5 \
-    --segments 6 --window 90 --repeats 2
+dptse replay-field --density density.txt --speed speed.txt --cell 0.1 \
+    --interval 5 --segments 6 --window 90 --repeats 2
 
 The field is the truth. Some of its segments are queried every second, by round robin, and released
 with noise; the segments at both ends are known.

@@ -1,10 +1,10 @@
 r"""Train a query policy in a folder, and go on there after an interruption.
 
-dptse train --env dptse_env:dptse/ShortHighway-v0 --keywords '{"bandwidth": 1}' --steps 40000 \
-    --traffic 0:8 --validation 1000:1004
+dptse train --env dptse_env:dptse/ShortHighway-v0 --keywords '{"bandwidth": 1}' \
+    --steps 40000 --traffic 0:8 --validation 1000:1004
 
-The folder gets best.safetensors and policy.safetensors (the policy best in validation, and the
-last), progress.csv and curve.png (the learning curve, beside rules), plan.json (the settings) and
+It writes best.safetensors and policy.safetensors (the policy best in validation, and the last),
+progress.csv and curve.png (the learning curve, beside rules), plan.json (the settings) and
 checkpoint.pt. The same command goes on from the last checkpoint; plackett-luce with a number of
 rounds comes to the same numbers.
 """

@@ -1,12 +1,13 @@
-"""Tune settings of estimators on training traffic, one set per environment and estimator.
+r"""Tune settings of estimators on training traffic, one set per environment and estimator.
 
-dptse tune --env dptse_env:dptse/ShortHighway-v0 --estimators random_walk --seeds 0:2 --trials 4
+dptse tune --env dptse_env:dptse/ShortHighway-v0 --estimators random_walk \
+    --seeds 0:2 --trials 4
 
-Each set is left in <output>/<estimator>-<ARZ parameters>-<privacy preset>.json, a file that the
-keyword estimator_settings takes, in Python, after --env or in the table environment of a road file.
-Trials are kept in a journal beside it: the same command goes on where it stopped, and searches on
-with more --trials. With one worker they are the same ones whenever the seed is; with several, later
-trials depend on the order in which earlier ones end.
+It writes each set to <output>/<estimator>-<ARZ parameters>-<privacy preset>.json, a file for the
+keyword estimator_settings, in Python, after --env or in the table environment of a road file.
+A journal beside it keeps the trials: the same command goes on where it stopped, and searches on
+with more --trials. With one worker a seed always gives the same trials; with several, later trials
+depend on the order in which earlier ones end.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def make_searches(args: Args) -> dict[str, Search]:
 
 
 def main(args: Args) -> None:
-    """Record what is missing, run the trials that are missing, and leave the sets."""
+    """Record what is missing, run the trials that are missing, and write the sets."""
     searches, executor = make_searches(args), make_executor("local", args.workers)
     foreign = [name for name, s in searches.items() if not journal_path(s, args.output).exists()]
     refuse_to_replace([args.output / f"{name}.json" for name in foreign], args.force)

@@ -143,6 +143,9 @@ def test_information_has_what_a_bug_report_needs():
     page = run_command("info").stdout
     for value in (dptse_env.__version__, found["digest"], found["packages"]["numpy"]):
         assert value in page
+    for cache in ("records", "kernels"):
+        assert re.search(rf"^{cache}: \d+ files, [\d.]+ MB in /", page, re.MULTILINE)
+    assert len(page.splitlines()) <= 24
 
 
 @pytest.mark.parametrize(
