@@ -25,7 +25,7 @@ from dptse_env.utils.registry import needed_for
 FRAMES = 140
 """Most positions of the slider: more would make the page large and slow."""
 
-TRUTH = "#444444"
+TRUTH = "#000000"
 
 
 class Watched:
@@ -102,29 +102,35 @@ def write_page(
         import plotly.graph_objects as go  # noqa: PLC0415
         from plotly.subplots import make_subplots  # noqa: PLC0415
 
-    first = episodes[0].history
+    first, metrics = episodes[0].history, list(errors[0][1])
     n_rows = 3 + len(episodes)
+    whole_row = [{"colspan": len(metrics)}, *[None] * (len(metrics) - 1)]
     figure = make_subplots(
         rows=n_rows,
-        cols=1,
+        cols=len(metrics),
+        specs=[[{}] * len(metrics), *[whole_row] * (n_rows - 1)],
         subplot_titles=[
-            "Errors of all policies",
-            f"True density, traffic seed {seed} [veh/km]",
-            *(f"{each.name}: estimate [veh/km], and what it queried" for each in episodes),
-            "Along the road at the second of the slider [veh/km]",
+            *map(error_label, metrics),
+            f"True density on traffic seed {seed}",
+            *(f"{each.name}: estimated density, queried segments dotted" for each in episodes),
+            "Density along the road in the second of the slider",
         ],
-        row_heights=[0.8, *[1.0] * (1 + len(episodes)), 1.4],
+        row_heights=[0.3 + 0.1 * len(errors), *[1.0] * (1 + len(episodes)), 1.4],
         vertical_spacing=0.36 / n_rows,
     )
-    for metric, colour in zip(errors[0][1], COLOURS, strict=False):
+    for column, metric in enumerate(metrics, 1):
         figure.add_bar(
-            x=[name for name, _ in errors],
-            y=[each[metric][0] for _, each in errors],
-            error_y={"type": "data", "array": [each[metric][1] for _, each in errors]},
-            name=error_label(metric),
-            marker_color=colour,
+            x=[each[metric][0] for _, each in errors],
+            y=[name for name, _ in errors],
+            error_x={"type": "data", "array": [each[metric][1] for _, each in errors]},
+            orientation="h",
+            marker_color=COLOURS[0],
+            showlegend=False,
             row=1,
-            col=1,
+            col=column,
+        )
+        figure.update_yaxes(
+            autorange="reversed", showticklabels=column == 1, dtick=1, row=1, col=column
         )
     places = np.cumsum([0.0, *first.lengths])
     largest = max(first.density_scale, float(np.max(first.truth)))
@@ -140,7 +146,7 @@ def write_page(
             x=seconds,
             y=middles[segments],
             mode="markers",
-            marker={"size": 2, "color": "white", "opacity": 0.6},
+            marker={"size": 3, "color": "white", "opacity": 0.7},
             hoverinfo="skip",
             showlegend=False,
             row=row,
@@ -159,18 +165,22 @@ def write_page(
         title=title,
         template="plotly_white",
         height=240 * n_rows,
-        barmode="group",
-        coloraxis={"colorscale": DENSITY_MAP, "cmin": 0, "cmax": largest},
+        coloraxis={
+            "colorscale": DENSITY_MAP,
+            "cmin": 0,
+            "cmax": largest,
+            "colorbar": {"title": {"text": "density<br>[veh/km]"}, "len": 0.5, "y": 0.55},
+        },
         legend={"orientation": "h", "y": -0.12},
         sliders=[_slider(seconds_shown)],
     )
     for row in range(2, 3 + len(episodes)):
-        figure.update_yaxes(title="road [km]", row=row, col=1)
+        figure.update_yaxes(title="position [km]", row=row, col=1)
         last = row == 2 + len(episodes)
         ends = [-0.5, len(first.truth) - 0.5]
-        figure.update_xaxes(title="second" if last else None, range=ends, row=row, col=1)
-    figure.update_xaxes(title="road [km]", row=n_rows, col=1)
-    figure.update_yaxes(range=[0, largest], row=n_rows, col=1)
+        figure.update_xaxes(title="time [s]" if last else None, range=ends, row=row, col=1)
+    figure.update_xaxes(title="position along the road [km]", row=n_rows, col=1)
+    figure.update_yaxes(title="[veh/km]", range=[0, largest], row=n_rows, col=1)
     # Playing at once would draw the moving curves alone.
     write_atomically(path, figure.to_html(include_plotlyjs=True, auto_play=False))
 
@@ -179,7 +189,7 @@ def _profile(go: Any, episodes: Sequence[Watched], middles: FloatArray, second: 
     """Return truth and estimates along the road in one second."""
     truth = episodes[0].history.truth[second].round(1)
     line = {"color": TRUTH, "width": 3}
-    traces = [go.Scatter(x=middles, y=truth, name="truth", line=line, mode="lines")]
+    traces = [go.Scatter(x=middles, y=truth, name="true density", line=line, mode="lines")]
     for k, each in enumerate(episodes):
         error = {"type": "data", "array": (1.96 * each.density_std[second]).round(1)}
         rmse, epsilon = each.history.rmse[second], each.epsilon[second]

@@ -7,6 +7,7 @@ folder is put on the path when a tool runs.
 
 import importlib
 import io
+import os
 import sys
 from pathlib import Path
 
@@ -35,9 +36,13 @@ def main() -> None:
     try:
         with needed_for("dptse"):
             importlib.import_module("scripts.dptse").main(sys.argv[1:])
+        sys.stdout.flush()
     except MissingExtraError as problem:
         print(f"error: {problem}", file=sys.stderr)
         raise SystemExit(1) from problem
+    except BrokenPipeError:  # the reader of a pipe has seen enough, as head does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None
     except KeyboardInterrupt:  # while it loads
         print("\ninterrupted before it began", file=sys.stderr)
         raise SystemExit(130) from None

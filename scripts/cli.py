@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -136,9 +135,8 @@ def run(
         )
         with logging_redirect_tqdm(), warnings_told_once():
             main(given)
-    except BrokenPipeError:  # the reader of a pipe has seen enough, as head does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(141) from None
+    except BrokenPipeError:
+        raise
     except (*BAD_INPUT, *FAILURES) as problem:
         print(f"error: {_in_words(problem)}", file=sys.stderr)
         raise SystemExit(2 if isinstance(problem, BAD_INPUT) else 1) from problem

@@ -7,8 +7,6 @@ import sys
 from collections.abc import Sequence
 
 import dptse_env
-from scripts.cli import run
-
 GROUPS = {
     "try": {
         "evaluate": "compare schedules and policies on traffic",
@@ -51,9 +49,13 @@ def main(words: Sequence[str]) -> None:
     elif name == "--version":
         print(f"dptse {dptse_env.__version__}")
     elif name in MODULES:
+        from scripts.cli import run  # noqa: PLC0415  (slow to import)
+
         module = importlib.import_module(MODULES[name])
-        about = {"program": f"dptse {name}", "words": rest, "resumes": name not in ANEW}
-        run(module.main, module.Args, module.__doc__, **about)
+        program, resumes = f"dptse {name}", name not in ANEW
+        run(
+            module.main, module.Args, module.__doc__, program=program, words=rest, resumes=resumes
+        )  # fmt: skip
     else:
         known = ", ".join(MODULES)
         print(f"error: there is no command {name!r}, there are {known}", file=sys.stderr)

@@ -277,10 +277,10 @@ def draw_traffic(args: Args, title: str, scores: Scores, cells: Sequence[Cell]) 
 def make_title(cell: Cell, seeds: Sequence[int]) -> str:
     """Return what is evaluated, in words, given one of the cells."""
     config = make_config(cell.env, cell.keywords)
-    noise = f"{config.privacy.preset} noise at ({config.privacy.epsilon:g}, "
-    noise += f"{config.privacy.delta:g})"
+    model = f"parameters {config.arz_parameters.name}, release model {config.privacy.preset}"
+    privacy = f"epsilon {config.privacy.epsilon:g}, delta {config.privacy.delta:g}"
     traffic = f"{len(seeds)} episode{'s' * (len(seeds) > 1)} on {seed_kind(seeds)} traffic"
-    return f"{cell.env.rpartition('/')[2]}, {config.arz_parameters.name}, {noise}, {traffic}"
+    return f"{cell.env.rpartition('/')[2]}, {model} ({privacy}), {traffic}"
 
 
 def main(args: Args) -> None:
@@ -330,8 +330,5 @@ def main(args: Args) -> None:
         said = verdict(rows, own, [c for c in cells if c.labels["estimator"] == estimator])
         if said:
             print(said)
-    page = f"; a browser opens {args.output / PAGE}" if args.html else ""
-    print(
-        f"tables are in {args.output}/, errors with bars in {args.output / ERRORS}, queries over "
-        f"space and time in {args.output / MAPS}{page}"
-    )
+    page = f", {PAGE} (for a browser)" if args.html else ""
+    print(f"wrote {args.output}/: {TABLES}, {ERRORS} (errors), {MAPS} (queries){page}")

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ import torch
 from tqdm import tqdm
 
 from agents.environments import make_config, parse_env
-from agents.training.run import BEST, POLICY, RULES_FILE, least
+from agents.training.run import BEST, RULES_FILE, least
 from agents.training.run_files import Row, check_plan, read_progress
 from agents.training.settings import PlackettLuceSettings, TrainingPlan, parse_algorithm
 from agents.training.training import train, train_all
@@ -109,7 +110,11 @@ def main(args: Args) -> None:
         with shown(args.output) as reporters:
             train(plan, args.output, records=args.records, **reporters)
     for folder in plans:
-        print(f"{folder}: {summary(read_progress(folder), best_rule(folder))}; {BEST}, {POLICY}")
+        print(f"{folder / BEST}: {summary(read_progress(folder), best_rule(folder))}")
+    if len(plan.envs) == 1:
+        policies = [str(folder / BEST) for folder in plans]
+        words = ["dptse", "evaluate", "--env", plan.envs[0], "--policies", *policies]
+        print(f"compare with rules on unseen traffic: {shlex.join(words)}")
 
 
 @contextlib.contextmanager
@@ -151,6 +156,6 @@ def summary(rows: list[Row], best: tuple[str, float]) -> str:
     error, (rule, other) = min(map(least, rows)), best
     share = 100.0 * (1.0 - error / other)
     return (
-        f"error x 1000 in validation {1000 * error:.1f}, {rule} {1000 * other:.1f}: "
-        f"{abs(share):.1f} % {'below' if share >= 0 else 'above'}"
+        f"error x 1000 in validation {1000 * error:.1f}, {abs(share):.1f} % "
+        f"{'below' if share >= 0 else 'above'} the best rule, {rule} ({1000 * other:.1f})"
     )

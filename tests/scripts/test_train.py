@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -35,19 +36,26 @@ def test_it_trains_and_goes_on(tmp_path):
     given = words(tmp_path / "one", "ppo")
     done = run_command("train", *given)
     assert done.returncode == 0, done.stderr
+    line, next_step = done.stdout.splitlines()
     said = re.fullmatch(
-        r"(.*): error x 1000 in validation ([\d.]+), ([a-z-]+) ([\d.]+): ([\d.]+) % (b|a)\w+; .*",
-        done.stdout.strip(),
+        r"(.*): error x 1000 in validation (?P<error>[\d.]+), (?P<share>[\d.]+) % (?P<side>\w+) "
+        r"the best rule, (?P<rule>[a-z-]+) \((?P<other>[\d.]+)\)",
+        line,
     )
-    assert said[1] == str(tmp_path / "one")
+    best = str(tmp_path / "one" / "best.safetensors")
+    assert said[1] == best
     rules = json.loads((tmp_path / "one" / "rules.json").read_text())
-    assert said[3] == min(rules, key=rules.get)
-    assert float(said[4]) == pytest.approx(1000 * rules[said[3]], abs=0.06)
-    away = float(said[5]) * (1 if said[6] == "b" else -1)
-    assert away == pytest.approx(100 * (1 - float(said[2]) / float(said[4])), abs=0.2)
+    rule, error, other = said["rule"], float(said["error"]), float(said["other"])
+    assert rule == min(rules, key=rules.get)
+    assert other == pytest.approx(1000 * rules[rule], abs=0.06)
+    away = float(said["share"]) * {"below": 1, "above": -1}[said["side"]]
+    assert away == pytest.approx(100 * (1 - error / other), abs=0.2)
     # The bar has the error beside the best rule's.
-    assert f"validation={said[2]}" in done.stderr
-    assert f"{said[3]}={said[4]}" in done.stderr
+    assert f"validation={said['error']}" in done.stderr
+    assert f"{rule}={said['other']}" in done.stderr
+    command = shlex.split(next_step.partition(": ")[2])
+    env = f'{SHORT} {{"horizon": 64}}'
+    assert command == ["dptse", "evaluate", "--env", env, "--policies", best]
     before = (tmp_path / "one" / "policy.safetensors").read_bytes()
     assert run_command("train", *given).stdout == done.stdout
     assert (tmp_path / "one" / "policy.safetensors").read_bytes() == before
@@ -75,9 +83,10 @@ def test_bad_input_is_one_line_and_leaves_nothing(more, message, tmp_path):
 def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
     given = words(tmp_path, "plackett-luce", "--seeds", "0:2", "--workers", "1")
     done = run_command("train", *given)
-    assert [line.partition(":")[0] for line in done.stdout.splitlines()] == [
-        str(tmp_path / seed) for seed in "01"
-    ]
+    best = [str(tmp_path / seed / "best.safetensors") for seed in "01"]
+    *lines, next_step = done.stdout.splitlines()
+    assert [line.partition(":")[0] for line in lines] == best
+    assert next_step.endswith(shlex.join(["--policies", *best]))
     first, second = (without_time(read_progress(tmp_path / seed)) for seed in "01")
     assert first[-1]["validation"] != second[-1]["validation"]
 
