@@ -12,6 +12,7 @@ import logging
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -145,8 +146,12 @@ class LocalProcesses(ThreadPoolExecutor):
 
 
 def _begin(parent: int) -> None:
-    """Begin a local process: it follows its parent, and logs on lines of their own."""
+    """Begin a local process: it follows its parent, and logs on lines of their own.
+
+    The parent has made the same environments before, so it has given their warnings.
+    """
     follow_parent(parent)
+    warnings.filterwarnings("ignore", category=UserWarning, module="dptse_env")
     # In a terminal a bar of the parent stands in the line.
     start = "\r\033[K" if sys.stderr.isatty() else ""
     logging.basicConfig(format=f"{start}%(message)s")

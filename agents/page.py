@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -110,9 +111,9 @@ def write_page(
         cols=len(metrics),
         specs=[[{}] * len(metrics), *[whole_row] * (n_rows - 1)],
         subplot_titles=[
-            *map(error_label, metrics),
+            *(error_label(metric).replace(" [", "<br>[") for metric in metrics),
             f"True density on traffic seed {seed}",
-            *(f"{each.name}: estimated density, queried segments dotted" for each in episodes),
+            *(f"{each.name}: estimated density, queries dotted" for each in episodes),
             "Density along the road in the second of the slider",
         ],
         row_heights=[0.3 + 0.1 * len(errors), *[1.0] * (1 + len(episodes)), 1.4],
@@ -152,17 +153,19 @@ def write_page(
             row=row,
             col=1,
         )
+    figure.update_annotations(font_size=13)
     n_fixed = len(figure.data)
-    for trace in _profile(go, episodes, middles, 0):
+    seconds_shown = range(0, len(first.truth), max(math.ceil(len(first.truth) / FRAMES), 1))
+    begun = len(seconds_shown) // 2  # the estimates of second 0 are all the same
+    for trace in _profile(go, episodes, middles, seconds_shown[begun]):
         figure.add_trace(trace, row=n_rows, col=1)
     moving = list(range(n_fixed, len(figure.data)))
-    seconds_shown = range(0, len(first.truth), max(math.ceil(len(first.truth) / FRAMES), 1))
     figure.frames = [
         go.Frame(data=_profile(go, episodes, middles, second), traces=moving, name=str(second))
         for second in seconds_shown
     ]
     figure.update_layout(
-        title=title,
+        title="<br>".join(textwrap.wrap(title, 60)),
         template="plotly_white",
         height=240 * n_rows,
         coloraxis={
@@ -172,7 +175,7 @@ def write_page(
             "colorbar": {"title": {"text": "density<br>[veh/km]"}, "len": 0.5, "y": 0.55},
         },
         legend={"orientation": "h", "y": -0.12},
-        sliders=[_slider(seconds_shown)],
+        sliders=[_slider(seconds_shown, begun)],
     )
     for row in range(2, 3 + len(episodes)):
         figure.update_yaxes(title="position [km]", row=row, col=1)
@@ -207,9 +210,10 @@ def _profile(go: Any, episodes: Sequence[Watched], middles: FloatArray, second: 
     return traces
 
 
-def _slider(seconds: Sequence[int]) -> dict[str, Any]:
+def _slider(seconds: Sequence[int], begun: int) -> dict[str, Any]:
     now = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}}
     return {
+        "active": begun,
         "currentvalue": {"prefix": "second "},
         "pad": {"t": 40},
         "steps": [

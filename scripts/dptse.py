@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 import dptse_env
+
 GROUPS = {
     "try": {
         "evaluate": "compare schedules and policies on traffic",

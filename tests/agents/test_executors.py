@@ -3,6 +3,7 @@ import os
 import signal
 import sys
 import time
+import warnings
 
 import pytest
 
@@ -63,6 +64,16 @@ def test_there_are_as_many_processes_as_asked_for_and_they_leave_interrupts_to_t
     assert len(places) <= 2
     assert os.getpid() not in places
     assert run(executor, interrupted, range(2)) == [0, 1]
+
+
+def n_warnings(module):
+    with warnings.catch_warnings(record=True) as given:
+        warnings.warn_explicit("again", UserWarning, "file.py", 1, module)
+    return len(given)
+
+
+def test_processes_do_not_repeat_the_warnings_of_this_one():
+    assert run(LocalProcesses(2), n_warnings, ["dptse_env.config", "torch"]) == [0, 1]
 
 
 def dies(number):
