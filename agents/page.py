@@ -166,6 +166,7 @@ def write_page(
     ]
     figure.update_layout(
         title="<br>".join(textwrap.wrap(title, 60)),
+        margin={"t": 140},
         template="plotly_white",
         height=240 * n_rows,
         coloraxis={

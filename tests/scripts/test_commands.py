@@ -123,6 +123,29 @@ def test_a_pipe_may_lack_letters(monkeypatch):
     assert pipe.buffer.getvalue().endswith(b"?\n")
 
 
+def test_ctrl_c_while_the_program_loads_is_one_line(monkeypatch, capsys):
+    def load(name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command_line.importlib, "import_module", load)
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err.split() == ["interrupted", "before", "it", "began"]
+
+
+def test_a_pipe_may_be_closed_as_by_head():
+    program = "import sys; from dptse_env.command_line import main; sys.stdin.read(); main()"
+    words = [sys.executable, "-c", program, "--help"]
+    with subprocess.Popen(
+        words, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as ended:
+        ended.stdout.close()
+        ended.stdin.close()
+        assert ended.stderr.read() == b""
+    assert ended.returncode == 141
+
+
 def test_information_on_trips_is_a_row_for_each_number_of_them():
     header, *rows = [
         row.split() for row in run_command("info", "--mu", "2.118").stdout.splitlines()
