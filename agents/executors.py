@@ -34,6 +34,7 @@ from tqdm import tqdm
 from dptse_env.command_line import TOOLS
 from dptse_env.traffic.recording import follow_parent, uninterrupted
 from dptse_env.utils.fields import integer
+from dptse_env.utils.kernels import compiling_is_said
 from dptse_env.utils.registry import needed_for
 
 TaskT = TypeVar("TaskT")
@@ -139,18 +140,21 @@ class LocalProcesses(ThreadPoolExecutor):
                 self.workers,
                 timeout=IDLE,
                 initializer=_begin,
-                initargs=(os.getpid(),),
+                initargs=(os.getpid(), compiling_is_said.is_set()),
                 env={"OMP_NUM_THREADS": "1"},
             )
         return self._pool
 
 
-def _begin(parent: int) -> None:
+def _begin(parent: int, is_said: bool) -> None:
     """Begin a local process: it follows its parent, and logs on lines of their own.
 
-    The parent has made the same environments before, so it has given their warnings.
+    It repeats nothing: the parent has made the same environments before, so it has given their
+    warnings, and perhaps said that estimators are compiled.
     """
     follow_parent(parent)
+    if is_said:
+        compiling_is_said.set()
     warnings.filterwarnings("ignore", category=UserWarning, module="dptse_env")
     # In a terminal a bar of the parent stands in the line.
     start = "\r\033[K" if sys.stderr.isatty() else ""

@@ -49,7 +49,7 @@ _PACKAGE = __name__.partition(".")[0]
 _SLOW = f"{_PACKAGE}.estimators."
 """Modules of kernels that take long to compile; one of the others takes a second at most."""
 
-_is_said = threading.Event()
+compiling_is_said = threading.Event()
 """Whether this process, or the one that it has waited for, has said that it compiles."""
 
 _OPTIONS: dict[str, Any] = {
@@ -240,7 +240,7 @@ def _alone(path: Path) -> Iterator[None]:
         try:
             lock.acquire(timeout=0.0)
         except Timeout:
-            _is_said.set()  # by the other one
+            compiling_is_said.set()  # by the other one
             lock.acquire(timeout=LONGEST_WAIT)
     try:
         yield
@@ -275,8 +275,8 @@ def _remove_unused(folder: Path) -> None:
 
 def _say_compiling() -> None:
     """Say once what takes long now, and how long."""
-    if not _is_said.is_set():
-        _is_said.set()
+    if not compiling_is_said.is_set():
+        compiling_is_said.set()
         logger.warning("Compiling the estimator, once on this machine: about 10 s, the MHE 25 s")
 
 

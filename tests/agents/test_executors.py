@@ -15,6 +15,7 @@ from agents.executors import (
     run_in_order,
     run_shown,
 )
+from dptse_env.utils.kernels import compiling_is_said
 from dptse_env.utils.registry import MissingExtraError
 
 
@@ -72,8 +73,14 @@ def n_warnings(module):
     return len(given)
 
 
-def test_processes_do_not_repeat_the_warnings_of_this_one():
+def is_said(_):
+    return compiling_is_said.is_set()
+
+
+def test_processes_do_not_repeat_what_this_one_has_said():
     assert run(LocalProcesses(2), n_warnings, ["dptse_env.config", "torch"]) == [0, 1]
+    compiling_is_said.set()
+    assert run(LocalProcesses(2), is_said, [1]) == [True]
 
 
 def dies(number):

@@ -170,12 +170,12 @@ print("done", flush=True)
 def said(monkeypatch, caplog):
     """Return what is said of compiling, where all kernels are slow."""
     monkeypatch.setattr(kernels, "_SLOW", "")
-    monkeypatch.setattr(kernels, "_is_said", threading.Event())
+    monkeypatch.setattr(kernels, "compiling_is_said", threading.Event())
     caplog.set_level(logging.WARNING, logger=LOG)
     return caplog
 
 
-def test_compiling_what_is_slow_is_said_once(load, kept, said, monkeypatch):
+def test_compiling_what_is_slowcompiling_is_said_once(load, kept, said, monkeypatch):
     module = load()
     module.run(1.5)
     module.second(module.Pair(1.5, 2.5))
@@ -183,7 +183,7 @@ def test_compiling_what_is_slow_is_said_once(load, kept, said, monkeypatch):
         "Compiling the estimator, once on this machine: about 10 s, the MHE 25 s"
     ]
     said.clear()
-    kernels._is_said.clear()
+    kernels.compiling_is_said.clear()
     load().run(1.5)  # which is kept
     monkeypatch.setattr(kernels, "_SLOW", "other")
     load(MODULE.replace("2.0", "4.0")).run(1.5)  # which is quick
