@@ -21,7 +21,7 @@ from scripts.cli import Environment, Machines
 
 
 @dataclass(frozen=True)
-class Args(Environment, Machines):
+class Args(Machines, Environment):
     """Audit the privacy of an environment."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v1"

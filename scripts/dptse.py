@@ -36,7 +36,7 @@ GROUPS = {
 """Commands by what a person wants. Each is a module of this folder with ``Args`` and ``main``."""
 
 ANEW = ("audit", "import", "info", "policy", "replay-field")
-"""Commands that begin anew after an interruption."""
+"""Commands that begin anew after an interruption, as others do with --force."""
 
 MODULES = {name: f"scripts.{name.replace('-', '_')}" for group in GROUPS.values() for name in group}
 MODULES["import"] = "scripts.import_road"
@@ -53,7 +53,7 @@ def main(words: Sequence[str]) -> None:
         from scripts.cli import run  # noqa: PLC0415  (slow to import)
 
         module = importlib.import_module(MODULES[name])
-        program, resumes = f"dptse {name}", name not in ANEW
+        program, resumes = f"dptse {name}", name not in ANEW and "--force" not in rest
         run(
             module.main, module.Args, module.__doc__, program=program, words=rest, resumes=resumes
         )  # fmt: skip

@@ -56,7 +56,7 @@ ERRORS, MAPS, PAGE = "schedules.png", "space_time.png", "page.html"
 
 
 @dataclass(frozen=True)
-class Args(Environment, Machines):
+class Args(Machines, Environment):
     """Evaluate query schedules and policies."""
 
     schedules: tuple[str, ...] = tuple(OBSERVATION_SCHEDULES)

@@ -14,7 +14,7 @@ from scripts.cli import Environment, Recording
 
 
 @dataclass(frozen=True)
-class Args(Environment, Recording):
+class Args(Recording, Environment):
     """Record traffic."""
 
     seeds: str = "0:16"

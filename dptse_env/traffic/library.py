@@ -13,6 +13,7 @@ it has reached a certain age.
 
 import contextlib
 import logging
+import math
 import multiprocessing
 import os
 import tempfile
@@ -183,7 +184,7 @@ class RecordLibrary:
         except OSError as error:
             raise RecordingError.from_cause(corridor, seeds[0], str(error)) from error
         if not progress:
-            _say_recording(corridor, len(seeds) / workers)
+            _say_recording(corridor, math.ceil(len(seeds) / workers))
         sources = {seed: _source(corridor, seed) for seed in seeds}
         about = {"desc": f"recording {corridor.name}", "unit": "seed"}
         with tqdm(total=len(seeds), disable=not progress, **about) as bar:
@@ -229,8 +230,11 @@ def open_library(records: Records) -> RecordLibrary:
     return RecordLibrary(records)
 
 
-def _say_recording(corridor: Corridor, n_seeds: float) -> None:
-    """Say that traffic is recorded: once for a road if it takes long, and otherwise to the log."""
+def _say_recording(corridor: Corridor, n_seeds: int) -> None:
+    """Say that traffic is recorded, one seed after another: once for a road if it takes long.
+
+    Otherwise it is for the log alone.
+    """
     seconds = n_seeds * corridor.duration * sum(corridor.segment_lengths) / RECORDED
     is_said = seconds < LONG or corridor.digest in _said or multiprocessing.parent_process()
     if not is_said:
