@@ -83,15 +83,13 @@ def test_the_example_of_the_help_runs_as_it_is_printed(name, tmp_path, monkeypat
     assert done.stdout
 
 
-def test_the_overview_has_every_command_and_so_has_the_page():
-    page = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
+def test_the_overview_has_every_command_and_fits_a_terminal():
     overview = run_command("--help").stdout
     lines = overview.splitlines()
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
     for name in MODULES:
         assert re.search(rf"^.{{16}}{name} ", overview, re.MULTILINE)
-        assert f"| `{name}" in page
     assert run_command().stdout == overview
     assert run_command("--version").stdout == f"dptse {dptse_env.__version__}\n"
 
