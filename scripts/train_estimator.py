@@ -1,7 +1,8 @@
 r"""Train recurrent networks as an estimator, for releases of flows and of speeds.
 
-dptse train-estimator --seeds 0:1 --rounds own:2:4 own:2:4 --traffic 0:2 \
-    --validation 1000:1001 --output results/network \
+dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --seeds 0:1 \
+    --rounds own:2:4 own:2:4 --traffic 0:2 --validation 1000:1001 \
+    --output results/network \
     --plan '{"windows": 2, "ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}'
 
 Each kind and seed is a training in a folder of its own. The best network of each kind on validation
