@@ -205,7 +205,7 @@ BAD = [
     ("make", {"observation": ["default", Clash]}, "observation .*:Clash must not be named 'age'"),
     ("make", UNKNOWN, "estimator_settings.gain is unknown; allowed"),
     ("reset", {"estimator": NoInnovations}, "estimator .*:NoInnovations must .* 'innovations'"),
-    ("reset", {"estimator": Nan}, r"estimator .*:Nan.estimate\(\) must return finite .* 'density'"),
+    ("reset", {"estimator": Nan}, r"estimator .*:Nan.estimate\(\) must .* 'density' .* got nan in"),
     ("reset", {"observation": [BlockOfNan]}, r"observation .*BlockOfNan.values\(\) must .* finite"),
     ("reset", {"reward": scalar_reward}, r"reward .*:scalar_reward must .* shape \(1,\)"),
     ("step", {"estimator": Late}, r"estimator .*:Late.estimate\(\) must return finite floats"),

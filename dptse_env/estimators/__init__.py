@@ -218,11 +218,16 @@ def check_estimate(estimator: Estimator, estimate: Estimate, n_segments: int) ->
     shape = estimator.n_episodes, n_segments
     for name in ("density", "speed", "density_std", "speed_std"):
         values = np.asarray(getattr(estimate, name, None))
-        if values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
-            raise ValueError(
-                f"estimator {name_of_class(estimator)}.estimate() must return finite floats "
-                f"{name!r} of shape {shape}, got {values.dtype} of shape {values.shape}"
-            )
+        got = f"{values.dtype} of shape {values.shape}"
+        if values.shape == shape and values.dtype.kind == "f":
+            if np.isfinite(values).all():
+                continue
+            episode, segment = np.argwhere(~np.isfinite(values))[0].tolist()
+            got = f"{values[episode, segment]} in episode {episode}, segment {segment}"
+        raise ValueError(
+            f"estimator {name_of_class(estimator)}.estimate() must return finite floats "
+            f"{name!r} of shape {shape}, got {got}"
+        )
 
 
 def _check_attributes(estimator: Estimator, model: ARZModel, n_episodes: int) -> None:
