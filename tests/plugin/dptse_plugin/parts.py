@@ -30,7 +30,7 @@ class SmoothedSettings:
 
 
 class Smoothed(BatchEstimator):
-    """Exponential smoothing of releases."""
+    """Exponential smoothing of releases of mean speeds; it does not read centred flows."""
 
     settings_type = SmoothedSettings
 
