@@ -1,7 +1,8 @@
 """Build the documentation site, build/site, and check it: python docs/_site/build.py.
 
 Pages and what they link to are copied to build/pages, where links lead from page to page. Lines
-``::: keywords CLASS`` and ``::: commands`` become tables of what the code declares.
+``::: keywords CLASS`` and ``::: commands`` become tables of what the code declares, and the note on
+such lines, which is for readers of the repository, is dropped.
 """
 
 import os
@@ -19,6 +20,8 @@ PAGES, SITE = ROOT / "build" / "pages", ROOT / "build" / "site"
 CODE = re.compile(r"(```.*?^ *```|`[^`\n]+`)", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#)[^)\s#]+")
 TABLE = re.compile(r"^::: (keywords|commands) ?(.*)$", re.MULTILINE)
+
+NOTE = re.compile(r"^> A line with `:::`.*\n\n", re.MULTILINE)
 
 
 def sources() -> dict[Path, Path]:
@@ -47,7 +50,8 @@ def prepare() -> None:
             place = places.setdefault(target, target.relative_to(ROOT))
             return os.path.relpath(place, places[source].parent)
 
-        parts = CODE.split(TABLE.sub(_table, source.read_text(encoding="utf-8")))
+        text = NOTE.sub("", source.read_text(encoding="utf-8"))
+        parts = CODE.split(TABLE.sub(_table, text))
         parts[::2] = [LINK.sub(lead, part) for part in parts[::2]]
         page = PAGES / places[source]
         page.parent.mkdir(parents=True, exist_ok=True)
