@@ -14,7 +14,7 @@ help:  ## Show this list.
 setup: $(READY)  ## Make the virtual environment with pinned packages.
 
 $(READY): pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make setup PYTHON=python3.11; this is " + sys.version)'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	# torch first and pinned: a looser request may bring gigabytes of GPU libraries.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
