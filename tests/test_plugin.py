@@ -199,7 +199,7 @@ HERE = __name__
 UNKNOWN = {"estimator": parts.Smoothed, "estimator_settings": {"gain": 1}}
 BAD = [
     ("make", {"estimator": "no_module:Filter"}, "estimator .* cannot be imported: ModuleNotFoundE"),
-    ("make", {"estimator": f"{HERE}:Missing"}, f"estimator .* {HERE} has no 'Missing'"),
+    ("make", {"estimator": f"{HERE}:Missing"}, f"estimator .* {HERE} has no 'Missing'; .*py"),
     ("make", {"estimator": NoUpdate}, r"estimator .*:NoUpdate must have update\(\)"),
     ("make", {"privacy": NoUpdate}, r"privacy\.preset .*:NoUpdate must be a subclass of"),
     ("make", {"observation": ["default", Clash]}, "observation .*:Clash must not be named 'age'"),

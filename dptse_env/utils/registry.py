@@ -127,17 +127,20 @@ class Registry(Mapping[str, Any]):
     def _imported(self, path: str) -> Any:
         module, _, name = path.partition(":")
         try:
-            found = importlib.import_module(module)
+            imported = importlib.import_module(module)
         except Exception as problem:
             raise ValueError(
                 f"{self.keyword} {path!r} cannot be imported: {type(problem).__name__}: {problem}"
             ) from problem
+        found: Any = imported
         try:
             for attribute in name.split("."):
                 found = getattr(found, attribute)
         except AttributeError as problem:
+            place = getattr(imported, "__file__", None) or [*getattr(imported, "__path__", [])]
             raise ValueError(
-                f"{self.keyword} {path!r} cannot be imported: {module} has no {name!r}"
+                f"{self.keyword} {path!r} cannot be imported: {module} has no {name!r}; it is at "
+                f"{place}"
             ) from problem
         return found
 
