@@ -72,7 +72,7 @@ class Args(Machines, Environment):
     """State estimators; the environment's own if none is given."""
     seeds: str = "2000:2008"
     """Traffic seeds, first:stop, that nothing was trained on."""
-    reference: str = "paper"
+    reference: str = "round-robin"
     """Schedule that the others are compared with."""
     noise_seed: int = 0
     """Seeds noise and estimators, one stream for each traffic seed."""

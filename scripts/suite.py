@@ -108,7 +108,7 @@ def print_scores(rows: pl.DataFrame, policies: Sequence[str]) -> None:
     rules = [f"{rule} {columns[rule][place]}" for place, rule in enumerate(best)]
     rooms = ["", *(f"{suite.room(rows, name).mean:.1f} %" for name in suite.CELLS)]
     title = f"{suite.NAME}: {suite.ZERO} has 0, {suite.ONE} has 1"
-    table = make_table(title, "cell", *policies, "best rule", f"{suite.ONE} below it")
+    table = make_table(title, "cell", *policies, "best rule", f"{suite.ONE} below best rule")
     shown = [columns[policy] for policy in policies]
     for line in zip(["mean", *suite.CELLS], *shown, rules, rooms, strict=True):
         table.add_row(*line)
