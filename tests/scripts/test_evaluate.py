@@ -33,7 +33,7 @@ def test_tables_rows_figures_and_json_agree(tmp_path):
     assert done.returncode == 0, done.stderr
     rows = rows_of(tmp_path / "out")
     assert set(rows.select("estimator", "policy", "traffic_seed").iter_rows()) == {
-        ("random_walk", name, seed) for name in ("none", "paper") for seed in (2000, 2001)
+        ("random_walk", name, seed) for name in ("none", "round-robin") for seed in (2000, 2001)
     }
     tables = (tmp_path / "out" / "tables.md").read_text()
     found = json.loads(run_command("evaluate", *words, "--force", "--json").stdout)
@@ -54,7 +54,7 @@ def test_tables_rows_figures_and_json_agree(tmp_path):
             assert f"{value:.2f} ±" in done.stdout
     (other,) = (row for row in found["rows"] if row["policy"] == "none")
     for metric, interval in other["differences"].items():
-        less = means["none"][metric] - means["paper"][metric]
+        less = means["none"][metric] - means["round-robin"][metric]
         assert interval["mean"] == pytest.approx(less)
     # The least error comes first.
     assert [row["policy"] for row in found["rows"]] == sorted(
@@ -75,7 +75,7 @@ def test_one_episode_has_no_interval(tmp_path):
     row = next(each for each in found["rows"] if each["policy"] == "none")
     error = row["means"]["error"]
     assert error == {"mean": pytest.approx(-1000.0 * reward), "low": None, "high": None, "n": 1}
-    other = rows_of(tmp_path, "paper")["reward"][0]
+    other = rows_of(tmp_path, "round-robin")["reward"][0]
     assert row["differences"]["error"]["mean"] == pytest.approx(1000.0 * (other - reward))
     tables = (tmp_path / "tables.md").read_text()
     assert "one episode has no interval" in tables.lower()
@@ -140,7 +140,7 @@ def test_estimators_and_keywords_reach_the_environment():
     assert all(each["privacy"] == {"preset": "capped", "cap": 9} for each in keywords)
     (own,) = make_cells(Args(env=SHORT, schedules=()))
     assert own.keywords == {}
-    assert own.labels == {"estimator": "ekf", "policy": "paper"}
+    assert own.labels == {"estimator": "ekf", "policy": "round-robin"}
 
 
 @pytest.mark.parametrize(
