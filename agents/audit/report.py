@@ -97,26 +97,27 @@ class Finding:
             trials = f"by the expected errors at {result.n} canaries of one run"
         print_text(
             f"worlds: {self.target}; queries: {self.policy}; noise x {self.noise_factor:g}\n"
-            f"distance: {self.distance:.3f} sigma {trials} ({self.seconds:.0f} s); "
-            f"{self.distance / claim.mu:.4f} of the claim\n"
-            f"epsilon of a Gaussian release with the bound on mu: {self.gaussian_epsilon:.3f}\n"
-            f"power against a mu of {VIOLATION:.2f} times the claim: {self.power:.4f}"
+            f"distance: {self.distance:.3f} standard deviations {trials} ({self.seconds:.0f} s), "
+            f"{self.distance / claim.mu:.4f} times the claim\n"
+            f"lower bound on mu, as epsilon at delta {claim.delta:g}: {self.gaussian_epsilon:.3f}\n"
+            f"power, the probability of rejecting a mu of {VIOLATION:.2f} times the claim: "
+            f"{self.power:.4f}"
         )
         if math.isfinite(self.detectable):
             factor = self.noise_factor * self.distance / self.detectable
             print_text(
-                f"rejected with probability 95 %: a mu of {self.detectable:.3f} or more, reached "
-                f"here up to {factor:.3f} times the declared noise"
+                f"sensitivity: it rejects a mu of {self.detectable:.3f} with probability 95 %; "
+                f"this target has it if the noise is {factor:.3f} times the declared one"
             )
         else:
             few = "canaries" if result.is_one_run else "runs"
             print_text(f"too few {few} to reject this claim, however much leaks")
         if result.mu_of_any is not None:
-            print_text(f"without independence of the noise: a mu of {result.mu_of_any:.3f} or more")
+            print_text(f"lower bound on mu for dependent noise: {result.mu_of_any:.3f}")
         if "boundary_inputs" in self.privacy.void_reasons:
             print_text(
-                "the estimates see the true traffic at the boundary, which makes their epsilon "
-                "infinite; only the releases were attacked"
+                'only the releases were attacked: boundary_inputs is "true", so the estimates use '
+                "the true traffic at the boundary, and their epsilon is infinite"
             )
         print_text(f"verdict: {result.verdict}, at confidence {result.confidence:.0%}")
 

@@ -35,18 +35,18 @@ _REFUSED = 1e4  # error x 1000 of parameters that violate the CFL condition
 MEANING = {
     ("free_flow_speed", "least"): "traffic is far slower than its limit: check speed_limit",
     ("free_flow_speed", "largest"): (
-        "v_f and gamma make up for each other here: v_f is a shape, not a speed that is driven"
+        "v_f and gamma compensate each other here: v_f shapes the curve, and nobody drives at it"
     ),
     ("free_flow_speed", "cfl"): (
         "the shortest segments and steps of 1 s allow no higher one; longer segments would"
     ),
     ("jam_density", "least"): (
-        "the settings' process noise is in units of it, and the filter would take less noise; but "
-        "traffic as dense as this was recorded, or no jam at all"
+        "a lower one lowers the filter's process noise, which is in units of it; but traffic as "
+        "dense as this was recorded, or no jam was"
     ),
     ("jam_density", "largest"): "no jam was recorded that would tell how dense one is",
     ("gamma", "least"): (
-        "speeds fall with the logarithm of density: v_f and the jam density make up for each other"
+        "speeds fall with the logarithm of density: v_f and the jam density compensate each other"
     ),
     ("gamma", "largest"): "speeds hardly depend on density: there was no queue to learn from",
     ("relaxation_time", "least"): "drivers follow the density at once",

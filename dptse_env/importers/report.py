@@ -130,7 +130,8 @@ def _markdown(content: Mapping[str, Any]) -> str:
         if file["off_the_road"]:
             parts.append(f"Off the road: {', '.join(file['off_the_road'])}.")
         if file["speed_ratio"] is not None:
-            parts.append(f"Speeds are {file['speed_ratio']:g} times what positions say.")
+            ratio = file["speed_ratio"]
+            parts.append(f"Its speeds are {ratio:g} times the speeds that its positions give.")
         parts.append("")
     parts.append("## Windows\n\n| seed | file | group | start [s] | vehicles |")
     parts.append("| --: | :-- | :-- | --: | --: |")

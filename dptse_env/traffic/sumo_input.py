@@ -143,7 +143,7 @@ def _netconvert() -> Path:
     """Return the path of the netconvert of `eclipse-sumo`; SUMO_HOME is not used."""
     spec = importlib.util.find_spec("sumo")
     if spec is None or spec.origin is None:
-        raise missing_extra("sumo", "netconvert, which compiles a corridor of another geometry,")
+        raise missing_extra("sumo", "a road of your own, which netconvert compiles,")
     suffix = ".exe" if os.name == "nt" else ""
     return Path(spec.origin).parent / "bin" / f"netconvert{suffix}"
 
