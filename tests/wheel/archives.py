@@ -26,11 +26,11 @@ FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}
 """Folders of a source archive."""
 BESIDE_THEM = {
     ".gitignore", "CHANGELOG.md", "CITATION.cff", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md",
-    "LICENSE", "Makefile", "README.md", "constraints.txt", "hatch_build.py",
+    "LICENSE", "Makefile", "README.md", "SECURITY.md", "constraints.txt", "hatch_build.py",
     "pyproject.toml", "zensical.toml",
 }  # fmt: skip
 IN_A_SOURCE_ARCHIVE = IN_A_WHEEL | {
-    ".css", ".ipynb", ".md", ".npz", ".png", ".toml", ".yaml", ".yml"
+    ".css", ".gif", ".ipynb", ".md", ".npz", ".png", ".toml", ".yaml", ".yml"
 }  # fmt: skip
 
 LARGEST = 4_000_000
