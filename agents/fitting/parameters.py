@@ -41,8 +41,8 @@ MEANING = {
         "the shortest segments and steps of 1 s allow no higher one; longer segments would"
     ),
     ("jam_density", "least"): (
-        "a lower one lowers the filter's process noise, which is in units of it; but traffic as "
-        "dense as this was recorded, or no jam was"
+        "the bound is the densest traffic of the records, or 40 veh/km for a lane. The search "
+        "wants less because the filter's process noise is in units of it"
     ),
     ("jam_density", "largest"): "no jam was recorded that would tell how dense one is",
     ("gamma", "least"): (
