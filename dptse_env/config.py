@@ -326,8 +326,8 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         config = replace(config, inherited=inherited)
         warnings.warn(
             f"{', '.join(inherited)}: values measured or tuned on {PRESETS[preset].corridor.name}, "
-            "or assumed, are used on another road or with other parameters; run `dptse fit` "
-            "on a road file, or give values of your own",
+            "or assumed, are used on another road or with other parameters; `dptse fit` "
+            "replaces them where that lowers the error",
             UserWarning,
             stacklevel=1,  # one place, so that Python tells it once, however environments are made
         )
