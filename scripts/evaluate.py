@@ -237,10 +237,14 @@ def verdict(rows: pl.DataFrame, own: Sequence[Score], cells: Sequence[Cell]) -> 
     if learned is None or rule is None or learned.means[ERROR].n == 1:
         return ""
     gain = below(rows, known[learned.policy].labels, known[rule.policy].labels)
+    low, mean, high = gain.low, gain.mean, gain.high
+    side = "below"
+    if mean < 0.0:
+        low, mean, high, side = -high, -mean, -low, "above"
     return (
         f"learned ({learned.policy}) {learned.means[ERROR].mean:.1f}, "
-        f"best rule ({rule.policy}) {rule.means[ERROR].mean:.1f}: {gain.mean:.1f} % below, "
-        f"95 % interval {gain.low:.1f} to {gain.high:.1f}, paired by traffic and noise"
+        f"best rule ({rule.policy}) {rule.means[ERROR].mean:.1f}: {mean:.1f} % {side}, "
+        f"95 % interval {low:.1f} to {high:.1f}, paired by traffic and noise"
     )
 
 
