@@ -128,6 +128,10 @@ def test_policies_and_schedules_play_what_gym_make_makes(tmp_path):
         expected = evaluate(env, policy, (999, 1000), 5)
         for row, own in zip(rows_of(tmp_path / "out", name).to_dicts(), expected, strict=True):
             assert {key: row[key] for key in own} == pytest.approx(own, abs=1e-9)
+    rules = [rows_of(tmp_path / "out", n)["reward"].mean() for n in ("oldest-first", "round-robin")]
+    gain = 100.0 * (1.0 - rows_of(tmp_path / "out", "run/best")["reward"].mean() / max(rules))
+    side = "below" if gain >= 0.0 else "above"
+    assert f": {abs(gain):.1f} % {side}, 95 % interval" in done.stdout
 
 
 def test_estimators_and_keywords_reach_the_environment():
