@@ -7,6 +7,7 @@ Both roads come from the files that the guides show; the network needs the extra
 
 import re
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -120,7 +121,8 @@ def draw_guides() -> None:
         save_figure(road, images / "road.png", "")
         write_files("your-network.md", folder)
         words = "--node-files town.nod.xml --edge-files town.edg.xml --output-file town.net.xml"
-        subprocess.run(["netconvert", *words.split()], cwd=folder, check=True, capture_output=True)
+        command = [str(Path(sys.executable).with_name("netconvert")), *words.split()]
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
         files = Files(folder / "town.net.xml", (folder / "town.rou.xml",))
         layout = find_layout(files, PATH, SEGMENT_LENGTH, between=True)
         save_figure(draw_network(files.net, layout), images / "network.png", "")

@@ -91,7 +91,8 @@ def run_line(line: str) -> str:
     """Run a command line of the package or of SUMO; others are those of an installation."""
     program, *words = shlex.split(line, comments=True)
     if program == "netconvert":
-        subprocess.run([program, *words], check=True, capture_output=True)
+        command = [str(Path(sys.executable).with_name(program)), *words]
+        subprocess.run(command, check=True, capture_output=True)
     if program != "dptse":
         return ""
     done = run_command(*words)

@@ -357,7 +357,7 @@ def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
             continue
         for rule, error in shown.items():
             draw_rule(axis, rule, error)
-        for learner, colour in zip(LEARNERS, COLOURS, strict=True):
+        for learner, colour in zip(LEARNERS, COLOURS, strict=False):
             own = curves.filter(setting=name, policy=learner).sort("training_seed", "seconds")
             for _, each in own.group_by("training_seed", maintain_order=True):
                 minutes = each["seconds"] / 60.0
