@@ -50,7 +50,7 @@ _SLOW = f"{_PACKAGE}.estimators."
 """Modules of kernels that take long to compile; one of the others takes a second at most."""
 
 compiling_is_said = threading.Event()
-"""Whether this process, or the one that it has waited for, has said that it compiles."""
+"""Set once this process, or the one that it has waited for, has said that it compiles."""
 
 _OPTIONS: dict[str, Any] = {
     "error_model": "numpy", "nogil": True, "nopython": True, "no_cfunc_wrapper": True,

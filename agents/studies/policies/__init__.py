@@ -98,7 +98,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     **{name: {"validations": 5} for name, _ in LEARNERS.values()},
     PLACKETT_LUCE: {"n_envs": 64, "regression": {"batches": 250}, "swaps": {"episodes": 60}},
 }  # fmt: skip
-"""What differs from tuned settings, by algorithm, in trainings of one minute: validations and
+"""Changes of the tuned settings, by algorithm, for trainings of one minute: validations and
 rounds that take a fair part of it."""
 LONG_CHANGES: dict[str, dict[str, Any]] = {
     **{name: {"validations": 2} for name, _ in LEARNERS.values()},
