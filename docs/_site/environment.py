@@ -12,6 +12,7 @@ import polars as pl
 from matplotlib.figure import Figure
 
 from agents.figures import (
+    COLOURS,
     Look,
     add_frame,
     draw_curve,
@@ -27,6 +28,7 @@ from agents.play import Cell
 from agents.statistics import Interval, mean_interval
 from agents.studies.guarantees import CURVE, paid
 from agents.studies.roads import OWN, on_road
+from agents.study import read_rows
 from agents.tables import ERROR, METRICS, error_label, mean, values
 from dptse_env.env import SensorQueryEnv
 from dptse_env.schedules import make_schedule
@@ -35,7 +37,7 @@ from dptse_env.utils.arrays import Observation
 ROOT = Path(__file__).parents[2]
 ENV = "dptse_env:dptse/PrivateHighway-v1"
 TRAFFIC = 2001  # its incident falls into the seconds that are shown
-BLUE, ORANGE = "#0072b2", "#d55e00"  # Okabe and Ito's: the colour-blind can tell them apart
+BLUE, ORANGE = COLOURS[:2]
 SCHEDULES = "round-robin", "paper", "oldest-first", "stale-variance", "speed-front", "oracle-error"
 SHOWN = slice(270, 410)  # seconds
 SECOND = 300
@@ -47,7 +49,7 @@ ESTIMATORS = (
 
 def rows_of(study: str) -> pl.DataFrame:
     """Return the rows of a study."""
-    return pl.read_parquet(ROOT / "results" / study / "rows.parquet")
+    return read_rows(study, ROOT / "results" / study)
 
 
 def draw_estimators() -> Figure:

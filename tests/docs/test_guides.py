@@ -53,7 +53,7 @@ GUIDES = {
 
 
 class Ran(NamedTuple):
-    """What the blocks of a guide printed, and the names of its Python."""
+    """The output of a guide's blocks, and the names of its Python."""
 
     printed: str
     names: dict[str, Any]
