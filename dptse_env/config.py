@@ -445,11 +445,21 @@ _SHORTCUTS = {
 
 def _check_keywords(values: Mapping[str, Any]) -> None:
     known = (*field_hints(EnvConfig), *_SHORTCUTS)
+    nested = {
+        "privacy": [model.settings_type for model in RELEASE_MODELS.values()],
+        "corridor": [Corridor],
+    }
     for key in values:
         if key not in known:
+            owners = [
+                name
+                for name, types in nested.items()
+                if any(key in field_hints(each) for each in types)
+            ]
+            hint = "".join(f"it is a field of {name}, {name}={{{key!r}: ...}}; " for name in owners)
             raise UnknownKeywordError(
-                f"{cut(key)} is unknown; allowed: {', '.join(known)} (got an unexpected keyword "
-                f"argument {shown(key)})"
+                f"{cut(key)} is unknown; {hint}allowed: {', '.join(known)} (got an unexpected "
+                f"keyword argument {shown(key)})"
             )
 
 

@@ -164,6 +164,7 @@ def test_a_spec_survives_json():
 
 BAD = {
     "bandwith is unknown": {"bandwith": 2},
+    r"unit is unknown; it is a field of privacy, privacy=.*; allowed: ": {"unit": "event"},
     "bandwidth must be": {"bandwidth": 2.5},
     "estimator must be one of": {"estimator": "kf"},
     "estimator must be a class": {"estimator": 3},
