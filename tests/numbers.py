@@ -58,8 +58,12 @@ SCHEDULES = (
     "largest-density-variance", "stale-variance", "largest-deviation", "speed-front", "none",
     "expected-reduction", "greedy-trace", "oracle-error", "oracle-gain",
 )  # fmt: skip
-POLICIES = {"private-highway": "capped", "capped-roads": "capped", "paced-roads": "paced"}
-"""Shipped policies and the release models that they were trained for."""
+POLICIES = {
+    "private-highway": "paced",
+    "private-highway-capped": "capped",
+    "short-highway": "paper",
+}
+"""Some policies of the package, and the release models that they were trained for."""
 RELEASES: dict[str, dict[str, Any]] = {
     "paper": {"privacy": "paper"},
     "corrected": {"privacy": "corrected"},
@@ -188,7 +192,7 @@ def choices(policy: str) -> Numbers:
     make = functools.partial(_make, "PrivateHighway-v1", horizon=SECONDS)
     if policy in POLICIES:
         saved = read_saved_policy(policy)
-        env = make(privacy=POLICIES[policy], **saved.keywords)
+        env = make(**{"privacy": POLICIES[policy], **saved.keywords})
         player = saved.load(env, allow=TRANSFERABLE)
     else:
         env = make()

@@ -33,6 +33,7 @@ from dptse_env.traffic import (
     write_corridor,
 )
 from dptse_env.traffic.imported import has_vehicles, recorded_seeds
+from dptse_env.traffic.sumo_input import network_xml
 from dptse_env.utils.fields import read_json, require
 
 CHOSEN = ("parameters", "estimator", "estimator_settings")
@@ -150,6 +151,8 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
     Raises:
         ValueError: The file, a keyword or a seed is out of range, or the road cannot be fitted; the
             message starts with a path and says what to change.
+        MissingExtraError: netconvert is missing.
+        NetworkError: netconvert refuses the road.
     """
     require(is_road_file(path), "road", "a road file, whose name ends in .toml", str(path))
     road = read_road(path)
@@ -194,10 +197,11 @@ def _lies_in(value: Any, folder: Path) -> bool:
 
 
 def _check_road(path: Path, corridor: Corridor) -> None:
-    """Refuse a road without traffic, and segments that no set of parameters could suit."""
+    """Refuse a road without traffic or network, and segments that suit no set of parameters."""
     if corridor.recordings is None and corridor.network is None:
         rates = [rate for _, rate in corridor.published_demand.mainline]
         require(max(rates) > 0.0, f"{path}: demand.mainline", "above 0 veh/h at some time", rates)
+        network_xml(corridor)  # so that netconvert refuses the road, or is missing, at once
     pairs = zip(corridor.segment_lengths, corridor.speed_limits, strict=True)
     for segment, (length, limit) in enumerate(pairs):
         least = LARGEST_W * limit / SECONDS_PER_HOUR

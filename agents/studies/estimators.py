@@ -63,7 +63,7 @@ ROUND_ROBIN = "round-robin"
 QUICK, SLOW_FILTERS = (EKF, WALK, "blend", SMOOTHING, LEARNED), ("ukf", "enkf", "mhe")
 EVERYONE = (*QUICK, *SLOW_FILTERS)
 POLICIES = ("paper", ROUND_ROBIN, "oldest-first", "stale-variance", "largest-deviation")
-SHIPPED = "private-highway"
+SHIPPED = "private-highway-capped"
 """A learned query policy for the world `CAPPED`, trained with the EKF."""
 CAPPED = "PrivateHighway-v1, capped"
 World = tuple[str, dict[str, Any]]

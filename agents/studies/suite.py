@@ -456,7 +456,7 @@ _LEAST = -0.5
 def draw_scores(scores: Scores, path: Path) -> None:
     """Save the scores of all policies but the references, dots by cell."""
     heights = {name: -k for k, name in enumerate(CELLS)}
-    figure = make_figure(8.4, 1.7 + 0.34 * len(CELLS))
+    figure = make_figure(8.4, 2.0 + 0.34 * len(CELLS))
     axis = figure.subplots()
     shown = {
         policy: {name: each.value for name, each in found.items() if each.value > _LEAST}
@@ -476,7 +476,7 @@ def draw_scores(scores: Scores, path: Path) -> None:
     axis.set_xlabel(f"score, those below {_LEAST} left out")
     axis.set_yticks(list(heights.values()), list(heights))
     title = f"{NAME}: 0 is the round robin, 1 the gain oracle"
-    save_figure(finish_figure(figure), path, title)
+    save_figure(finish_figure(figure, columns=4), path, title)
 
 
 STUDY = Study(

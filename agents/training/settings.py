@@ -116,7 +116,7 @@ class Regression:
     """Seconds simulated in every episode of a round."""
     interval: Count = 2
     """Seconds between two samples of an episode."""
-    batches: Count = 2000
+    batches: Count = 1000
     """Minibatches of a round."""
     batch_size: Count = 1024
     """Samples in a minibatch."""
@@ -140,7 +140,7 @@ class SwapRounds:
 
     rounds: Annotated[int, Interval(0, 99)] = 8
     """Number of rounds; 0 for none."""
-    episodes: Annotated[int, Interval(1, 9999)] = 480
+    episodes: Annotated[int, Interval(1, 9999)] = 160
     """Episodes of a round, simulated at once."""
     seconds: Count = 15
     """Seconds over which the effect of a swap is measured, and between two states of an episode."""

@@ -29,7 +29,10 @@ from dptse_env.traffic.scenario import draw_scenario
 from dptse_env.utils.files import replacing
 
 CELL = Cell(
-    "dptse_env:dptse/PrivateHighway-v1", "paced-roads", {"bandwidth": 2, "estimator": "recurrent"}
+    "dptse_env:dptse/PrivateHighway-v1",
+    "private-highway",
+    {"bandwidth": 2, "estimator": "recurrent"},
+    transferred=True,
 )
 SEED, STILL = 2009, 284
 SECONDS = range(120, 500, 4)

@@ -104,12 +104,14 @@ def _markdown(content: Mapping[str, Any]) -> str:
         f"- {name}: {len(each)} window(s) of {content['duration']} s, traffic seeds {ranges(each)}"
         for name, each in content["seeds"].items()
     ]
-    on_ramps = ", ".join(f"{rate:g}" for rate in content["demand"]["on_ramps"]) or "none"
-    shares = ", ".join(f"{share:g}" for share in content["exit_shares"]) or "none"
+    rates = ", ".join(f"{rate:g}" for rate in content["demand"]["on_ramps"])
+    on_ramps = f"{rates} veh/h on the on-ramps" if rates else "no on-ramps"
+    shares = ", ".join(f"{share:g}" for share in content["exit_shares"])
+    exits = f"exit shares {shares}" if shares else "no exits"
     parts.append(
         "\nMeasured in the windows of the first split: "
-        f"{content['demand']['mainline']:g} veh/h on the mainline, on-ramps {on_ramps} veh/h, "
-        f"exit shares {shares}, average dwell {content['average_dwell']:g} s.\n\n"
+        f"{content['demand']['mainline']:g} veh/h on the mainline, {on_ramps}, "
+        f"{exits}, average dwell {content['average_dwell']:g} s.\n\n"
         "![Points, density and speed](report.png)\n"
     )
     for file in content["files"]:

@@ -45,11 +45,8 @@ class PolicyFile:
 
     @property
     def identity(self) -> str:
-        """Digest of card and weights; of a file converted from an older form that of the old one.
-
-        Results that were recorded with the old file are recognised by it.
-        """
-        return str(self.card.get("converted_from", self.card["sha256"]))
+        """Digest of card and weights, by which recorded results know it."""
+        return str(self.card["sha256"])
 
 
 def shipped_policies() -> list[str]:

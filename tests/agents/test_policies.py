@@ -2,11 +2,9 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-import polars as pl
 import pytest
 
 from agents.policies import find_policy, read_saved_policy
@@ -66,13 +64,6 @@ def test_a_card_without_recipe_or_training_seed_is_refused(tmp_path, training):
     path.write_bytes(edited(path, lambda card, weights: card.update(training=training)))
     with pytest.raises(ValueError, match="not a saved policy"):
         read_saved_policy(path)
-
-
-def test_a_converted_policy_keeps_its_identity_in_recorded_results():
-    saved = read_saved_policy("private-highway")
-    assert saved.identity.startswith("5efbbd09f911b3d1")
-    rows = pl.read_parquet(Path(__file__).parents[2] / "results" / "suite" / "rows.parquet")
-    assert rows["cell"].str.contains(f"sha256:{saved.identity}").any()
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Policy files read without torch."""
 
-import hashlib
 import sys
 from pathlib import Path
 
@@ -13,29 +12,25 @@ from tests.hostile import check_hostile, edited
 
 SHIPPED = Path(dptse_env.policies.__file__).parent / "private-highway.safetensors"
 DIGESTS = {
-    "capped-roads": ("845aec0177e6", "e451a90da777"),
-    "paced-roads": ("ec2d9184add7", "32b08ca7fb5a"),
-    "private-highway": ("5efbbd09f911", "f394bf388888"),
+    "paper-highway-capped": "7e6cb086df0c",
+    "private-highway": "0c8572a97f6c",
+    "private-highway-capped": "6c3c21b2e144",
+    "short-highway": "4734616c6cd9",
+    "short-highway-paced": "79a42dbac647",
 }
-"""The first digits of the digests of the files as they were recorded, and of their weights."""
+"""The first digits of the digests of card and weights, by which recorded results know a policy."""
 
 
 def test_card_and_weights_are_read_without_torch(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     file = read_policy("private-highway")
-    assert file.card["training"]["seed"] == 3
+    assert file.card["training"]["seed"] == 1
     assert len(file.weights) == 6
     assert {array.dtype for array in file.weights.values()} == {np.dtype(np.float32)}
 
 
-def test_the_weights_are_those_of_the_files_that_were_recorded():
-    digests = {}
-    for name in shipped_policies():
-        file, content = read_policy(name), hashlib.sha256()
-        for key in sorted(file.weights):
-            content.update(file.weights[key].tobytes())
-        digests[name] = file.identity[:12], content.hexdigest()[:12]
-    assert digests == DIGESTS
+def test_the_policies_are_those_of_recorded_results():
+    assert {name: read_policy(name).identity[:12] for name in shipped_policies()} == DIGESTS
 
 
 def test_damage_is_refused(tmp_path):

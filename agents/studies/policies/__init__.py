@@ -39,6 +39,7 @@ from agents.figures import (
     shifted,
 )
 from agents.play import Cell
+from agents.policies import find_policy
 from agents.seeds import STUDY_TEST, TRAINING_VALIDATION
 from agents.statistics import Interval, bootstrap, interquartile_mean, percent_below, percent_of_way
 from agents.study import Study, read_table
@@ -144,6 +145,12 @@ SETTINGS = {
     ),
     "paper": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED),
 }
+SHIPPED = {
+    "short": "short-highway", "short-paced": "short-highway-paced",
+    **dict.fromkeys(("private-1", "private-2", "long"), "private-highway"),
+    "paper": "paper-highway-capped",
+}  # fmt: skip
+"""Policies that come with the package, by setting: `PLACKETT_LUCE` after nine minutes, not one."""
 CURVES = "curves.parquet"
 """Learning curves of the trainings that are finished, a line for each validation, with the digest
 of the best policy."""
@@ -169,15 +176,23 @@ def _cell(
         policy=file or policy,
         keywords=setting.keywords,
         labels={**played(name, policy, part), "training_seed": seed, "digest": digest},
+        transferred=policy in SHIPPED.values(),
         noise_seed=(STUDY_TEST if part == TEST else TRAINING_VALIDATION).start,
         seeds=seeds if part == TEST else traffic.validation,
     )
 
 
 def test_cells(rows: pl.DataFrame, folder: Path) -> list[Cell]:
-    """Return rules, oracles, and the best policies of the trainings that are there and finished."""
+    """Return what plays test traffic.
+
+    Rules, oracles, policies of the package, and the best ones of the trainings that are finished.
+    """
     del rows  # choices among these are the report's
     cells = [_cell(*each, TEST) for each in product(SETTINGS, (*RULES, ORACLE, GAIN))]
+    cells += [
+        _cell(name, policy, TEST, digest=find_policy(policy).identity)
+        for name, policy in SHIPPED.items()
+    ]
     trained = read_curves(folder).select("setting", "policy", "training_seed", "digest").unique()
     for setting, learner, seed, digest in trained.sort(pl.all()).iter_rows():
         file = training_folder(folder, setting, learner, seed) / "best.safetensors"
@@ -369,20 +384,23 @@ def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
 
 
 def draw_below(rows: pl.DataFrame, path: Path) -> None:
-    """Draw how far learners and oracles lie below the best rule of each setting."""
-    shown = (*LEARNERS, ORACLE, GAIN)
+    """Draw how far learners, shipped policies and oracles lie below the best rule."""
     figure, axes = _panels((each.description for each in SETTINGS.values()), sharey=True)
     for axis, name in zip(axes, SETTINGS, strict=True):
-        for place, policy in enumerate(shown):
+        looks = {
+            **dict.fromkeys(LEARNERS, (COLOURS[0], "learners, a minute")),
+            SHIPPED.get(name, ""): (COLOURS[1], "policies of the package, nine minutes"),
+            **dict.fromkeys((ORACLE, GAIN), (GREY, "oracles")),
+        }
+        for place, (policy, look) in enumerate(looks.items()):
             try:
-                below = compared(rows, name, policy, BELOW)
+                draw_dot(axis, compared(rows, name, policy, BELOW), -place, *look)
             except UnmeasuredError:
                 continue
-            colour = COLOURS[0] if policy in LEARNERS else GREY
-            draw_dot(axis, below, -place, colour, "learners" if policy in LEARNERS else "oracles")
         axis.axvline(0.0, color=GREY, linewidth=0.8)
         axis.margins(x=0.2)
-        axis.set_yticks([-place for place in range(len(shown))], shown)
+        labels = (*LEARNERS, "package", ORACLE, GAIN)
+        axis.set_yticks([-place for place in range(len(labels))], labels)
         axis.set_xlabel("below the best rule [%]", fontsize=8)
     title = "Errors below the best rule's; 95 % intervals"
     save_figure(finish_figure(figure), path, title)
@@ -475,7 +493,8 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     named = {*played("", ""), "training_seed", "digest"} - set(rows.columns)
     rows = rows.with_columns(pl.lit(None).alias(name) for name in sorted(named))
     # A training that was begun anew has left rows of the policy that it had before.
-    present = ["", *curves["digest"].unique()]
+    shipped = [find_policy(each).identity for each in SHIPPED.values()]
+    present = ["", *shipped, *curves["digest"].unique()]
     rows = rows.filter(pl.col("digest").cast(pl.String).fill_null("").is_in(present))
     parts = ["# Query policies"]
     if not rows.filter(part=TEST).is_empty():

@@ -136,7 +136,11 @@ def test_plans_that_are_refused(changes, message):
         ("ppo", {"minutes": 0.0, "steps": None}, "minutes must be a finite number > 0, got 0"),
         ("ppo", {"steps": 0}, "steps must be an integer >= 1, got 0"),
         ("plackett-luce", {"steps": 3}, "not for plackett-luce, which trains in rounds"),
-        ("dqn", {"initial": "paced-roads"}, "initial must be left out .*, got 'paced-roads'"),
+        (
+            "dqn",
+            {"initial": "private-highway"},
+            "initial must be left out .*, got 'private-h",
+        ),
     ],
 )
 def test_lengths_and_beginnings_that_are_refused(name, changes, message):
