@@ -218,6 +218,7 @@ def test_rows_off_the_road_are_dropped_and_counted(tmp_path):
     assert file["off_the_road"] == ["9"]
     text = (tmp_path / "imported" / "report.md").read_text()
     assert f"| {file['off_ends']} | dropped: before the road's start or beyond its end |" in text
+    assert "veh/h on the mainline, no on-ramps, no exits, average dwell" in text
 
 
 @pytest.mark.parametrize(
