@@ -8,7 +8,7 @@ training, and the learners that get further training seeds. Then all play test t
 every learner with the first of ``--training-seeds``, the best two of a setting with the others. The
 same command goes on after a kill. The report needs the rows and ``curves.parquet`` alone.
 
-dptse study policies --train 1 --training-seeds 0:3 --workers 2
+dptse study policies --train 1 --training-seeds 0:5 --workers 2
 dptse study policies --report
 """
 
