@@ -350,7 +350,7 @@ def setting_table(rows: pl.DataFrame, curves: pl.DataFrame, setting: str) -> str
 
 def _panels(titles: Iterable[str], label: str = "", **options: Any) -> tuple[Figure, list[Axes]]:
     """Return a figure of up to eight panels with titles; ``label`` is that of their left edge."""
-    figure, named = make_figure(7.2, 8.8), list(titles)
+    figure, named = make_figure(7.2, 8.8, dpi=105), list(titles)
     axes = list(figure.subplots(4, 2, **options).ravel())
     for axis in axes[len(named) :]:
         axis.remove()
