@@ -445,21 +445,23 @@ _SHORTCUTS = {
 
 def _check_keywords(values: Mapping[str, Any]) -> None:
     known = (*field_hints(EnvConfig), *_SHORTCUTS)
+    for key in values:
+        if key not in known:
+            hints = [f"it is a field of {name}, {name}={{{key!r}: ...}}; " for name in _owners(key)]
+            raise UnknownKeywordError(
+                f"{cut(key)} is unknown; {''.join(hints)}allowed: {', '.join(known)} (got an "
+                f"unexpected keyword argument {shown(key)})"
+            )
+
+
+def _owners(key: str) -> list[str]:
+    """Return the keywords that have a field of this name."""
     # A plugin that nobody has used yet is a name.
     models = [each for each in RELEASE_MODELS.values() if not isinstance(each, str)]
     nested = {"privacy": [each.settings_type for each in models], "corridor": [Corridor]}
-    for key in values:
-        if key not in known:
-            owners = [
-                name
-                for name, types in nested.items()
-                if any(key in field_hints(each) for each in types)
-            ]
-            hint = "".join(f"it is a field of {name}, {name}={{{key!r}: ...}}; " for name in owners)
-            raise UnknownKeywordError(
-                f"{cut(key)} is unknown; {hint}allowed: {', '.join(known)} (got an unexpected "
-                f"keyword argument {shown(key)})"
-            )
+    return [
+        name for name, types in nested.items() if any(key in field_hints(each) for each in types)
+    ]
 
 
 def _corridor(base: Corridor, values: dict[str, Any]) -> Corridor:

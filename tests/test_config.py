@@ -12,13 +12,14 @@ from dptse_env.config import (
     TEST_SEEDS,
     TRAINING_SEEDS,
     VALIDATION_SEEDS,
+    UnknownKeywordError,
     parse_seeds,
     resolve,
 )
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
 from dptse_env.estimators.settings import available_settings, load_settings
 from dptse_env.parts import make_release, make_task, privacy_report, warn_where_void
-from dptse_env.release import MOST_OPTIONS, CappedSettings, PrivacySettings
+from dptse_env.release import MOST_OPTIONS, RELEASE_MODELS, CappedSettings, PrivacySettings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
 from tests.helpers import SHORT, MeanRelease, SumRelease
 
@@ -263,3 +264,9 @@ def test_models_of_single_segments_take_what_says_so():
     assert resolve("short-highway", {"privacy": "capped", "query_spans": [1]}).queries.are_plain
     levels = {"privacy": MeanRelease, "price_levels": (1.0, 2.0)}
     assert resolve("short-highway", levels).queries.n_options == 12
+
+
+def test_the_hint_on_an_unknown_keyword_imports_no_plugin(monkeypatch):
+    monkeypatch.setitem(RELEASE_MODELS._parts, "other", "nowhere:Model")
+    with pytest.raises(UnknownKeywordError, match="it is a field of privacy"):
+        resolve("private-highway", {"unit": "event"})
