@@ -135,7 +135,7 @@ def run(
         )
         with logging_redirect_tqdm(), warnings_told_once():
             main(given)
-    except BrokenPipeError:
+    except BrokenPipeError:  # an OSError that is no failure; dptse_env.command_line ends it
         raise
     except (*BAD_INPUT, *FAILURES) as problem:
         print(f"error: {_in_words(problem)}", file=sys.stderr)

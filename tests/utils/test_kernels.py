@@ -175,7 +175,7 @@ def said(monkeypatch, caplog):
     return caplog
 
 
-def test_compiling_what_is_slowcompiling_is_said_once(load, kept, said, monkeypatch):
+def test_compiling_what_is_slow_is_said_once(load, kept, said, monkeypatch):
     module = load()
     module.run(1.5)
     module.second(module.Pair(1.5, 2.5))

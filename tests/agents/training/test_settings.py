@@ -139,7 +139,7 @@ def test_plans_that_are_refused(changes, message):
         (
             "dqn",
             {"initial": "private-highway"},
-            "initial must be left out .*, got 'private-h",
+            "initial must be left out .*, got 'private-highway'",
         ),
     ],
 )
