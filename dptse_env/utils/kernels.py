@@ -1,16 +1,16 @@
 """Compiled functions: kernels, which Python calls, and the parts that kernels call.
 
 numba compiles a kernel at its first call, and the machine code is kept on disk, in the folder of
-``NUMBA_CACHE_DIR`` or else in the user's cache. numba's own cache knows a function by the age of
-its file alone: it would go on with machine code whose parts or constants, in other files, have
-changed. Here it is found by the fingerprint of all the code that it reaches, wherever that lies.
+``NUMBA_CACHE_DIR`` or else in the user's cache. numba's own cache knows a function by its file
+alone: it would go on with machine code whose parts or constants, in other files, have changed. Here
+it is found by the fingerprint of all the code that it reaches, wherever that lies.
 
 Parts are compiled into the kernels that call them; called from Python they run as Python.
 """
 
 from __future__ import annotations
 
-import contextlib
+import errno
 import gc
 import hashlib
 import inspect
@@ -20,7 +20,6 @@ import os
 import pickle
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from functools import cache, cached_property
 from pathlib import Path
@@ -40,7 +39,7 @@ from numba.core.registry import CPUDispatcher
 from numba.experimental import structref
 
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
-from dptse_env.utils.files import write_atomically
+from dptse_env.utils.files import replacing
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +49,7 @@ _SLOW = f"{_PACKAGE}.estimators."
 """Modules of kernels that take long to compile; one of the others takes a second at most."""
 
 compiling_is_said = threading.Event()
-"""Set once this process, or the one that it has waited for, has said that it compiles."""
+"""Set once this process has said that it compiles."""
 
 _OPTIONS: dict[str, Any] = {
     "error_model": "numpy", "nogil": True, "nopython": True, "no_cfunc_wrapper": True,
@@ -58,12 +57,6 @@ _OPTIONS: dict[str, Any] = {
 
 COLLECTED_EVERY = 100_000
 """Objects after which Python looks for garbage while a kernel is compiled."""
-
-KEPT_FOR = 30 * 24 * 3600.0
-"""Seconds for which machine code that no process loads is kept on disk."""
-
-LONGEST_WAIT = 180.0
-"""Seconds to wait for a kernel that another process compiles; none takes more than 25 s."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -142,16 +135,26 @@ class _Part(CPUDispatcher):
 
 
 class _Kernel(CPUDispatcher):
-    """numba's dispatcher of a kernel, which one process at a time compiles."""
+    """numba's dispatcher of a kernel, whose machine code is kept on disk."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options)
-        self._cache = _Kept(self)
+        self._cache = _Kept(function)
 
     def compile(self, sig: Any) -> Any:
-        """Compile or load the version for a signature."""
-        with global_compiler_lock, self._cache.turn():
-            return super().compile(sig)
+        """Compile or load the version for a signature.
+
+        Python collects garbage seldom meanwhile, since the compiler makes objects by the million;
+        as often as usual, that takes a tenth of the time.
+        """
+        with global_compiler_lock:
+            usual = gc.get_threshold()
+            if usual[0] > 0:  # with 0 the caller has none collected
+                gc.set_threshold(max(usual[0], COLLECTED_EVERY), *usual[1:])
+            try:
+                return super().compile(sig)
+            finally:
+                gc.set_threshold(*usual)
 
 
 def default_folder() -> Path:
@@ -162,40 +165,37 @@ def default_folder() -> Path:
 
 
 class _Kept(NullCache):
-    """The machine code of a function on disk, a file for each signature."""
+    """The machine code of a function on disk, a file for each signature.
 
-    def __init__(self, dispatcher: CPUDispatcher) -> None:
-        function: Any = dispatcher.py_func
+    numba's own cache has an index of files, which can name the code that another process wrote.
+    """
+
+    def __init__(self, function: Any) -> None:
         self._function, self._folder = function, default_folder()
         self._name = f"{function.__module__}.{function.__qualname__}".replace("<locals>.", "")
-        self._waits = contextlib.ExitStack()
 
     # At the first use: before that, functions that are defined further down are missing.
     @cached_property
-    def _digest(self) -> str:
+    def _fingerprint(self) -> str:
         return fingerprint(self._function)
 
     def _path(self, signature: tuple[Any, ...], codegen: Any) -> Path:
         about = (
-            self._digest, list(map(_spelled, signature)), codegen.magic_tuple(),
+            self._fingerprint, list(map(_spelled, signature)), codegen.magic_tuple(),
             numba.__version__, sys.implementation.cache_tag,
         )  # fmt: skip
         digest = hashlib.sha256(repr(about).encode()).hexdigest()
         return self._folder / f"{self._name}-{digest[:32]}.machine-code"
 
     def load_overload(self, signature: tuple[Any, ...], context: Any) -> Any:
-        """Return kept machine code, or None.
-
-        Another process may be compiling the kernel: then wait, and return what it has kept.
-        """
+        """Return kept machine code, or None."""
         context.refresh()
-        path = self._path(signature, context.codegen())
-        loaded = _loaded(path, context)
-        if loaded is None:
-            self._waits.enter_context(_alone(self._folder / f"{self._name}.lock"))
-            loaded = _loaded(path, context)
-            if loaded is None and self._name.startswith(_SLOW):
-                _say_compiling()
+        loaded = _loaded(self._path(signature, context.codegen()), context)
+        if loaded is None and self._name.startswith(_SLOW) and not compiling_is_said.is_set():
+            compiling_is_said.set()
+            logger.warning(
+                "Compiling the estimator, once on this machine: about 10 s, the MHE 25 s"
+            )
         return loaded
 
     def save_overload(self, signature: tuple[Any, ...], compiled: Any) -> None:
@@ -203,88 +203,63 @@ class _Kept(NullCache):
         if compiled.library.has_dynamic_globals:
             raise TypeError(f"the machine code of {self._name} holds addresses")
         path = self._path(signature, compiled.codegen)
+        content = serialize.dumps(compiled._reduce())
         try:
-            write_atomically(path, serialize.dumps(compiled._reduce()))
-            _remove_unused(self._folder)
+            self._folder.mkdir(0o700, parents=True, exist_ok=True)
+            if not _is_private(self._folder):
+                raise PermissionError(errno.EPERM, "others can write to it")
+            if path.is_dir():
+                path.rmdir()  # if it is empty
+            with replacing(path) as temporary:
+                temporary.touch(0o600)
+                temporary.write_bytes(_digest(path, content) + b"\n" + content)
         except OSError as problem:
             _say_not_kept(self._folder, problem.strerror)
 
-    @contextlib.contextmanager
-    def turn(self) -> Iterator[None]:
-        """Let other processes go on at the end, whether or not compiling has failed.
-
-        Python collects garbage seldom meanwhile, since the compiler makes objects by the million;
-        as often as usual, that takes a tenth of the time.
-        """
-        usual = gc.get_threshold()
-        if usual[0] > 0:  # with 0 the caller has none collected
-            gc.set_threshold(max(usual[0], COLLECTED_EVERY), *usual[1:])
-        try:
-            with self._waits:
-                yield
-        finally:
-            gc.set_threshold(*usual)
-
-
-@contextlib.contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Wait until no other process has a lock, but not for ever, nor where there are no locks.
-
-    Compiling a kernel twice loses time only.
-    """
-    from filelock import FileLock, Timeout  # noqa: PLC0415  (slow to import)
-
-    lock = FileLock(path, thread_local=False)
-    with contextlib.suppress(OSError, NotImplementedError, Timeout):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            lock.acquire(timeout=0.0)
-        except Timeout:
-            compiling_is_said.set()  # by the other one
-            lock.acquire(timeout=LONGEST_WAIT)
-    try:
-        yield
-    finally:
-        lock.release()
-
 
 def _loaded(path: Path, context: Any) -> Any:
-    """Return the machine code of a file, None where there is none that can be read."""
+    """Return the machine code of a file, None where there is none that can be used.
+
+    To read it is to run it, so nobody but the user may have written it. Who can write to a folder
+    further up can put another one in its place, but none that belongs to the user.
+    """
     try:
-        kept = path.read_bytes()
-    except OSError:
+        if not _is_private(path.parent):
+            return None
+        kept = path.read_bytes() if _is_private(path) else b""
+    except OSError:  # it is missing, or else `save_overload` says or mends it
         return None
-    with contextlib.suppress(OSError):  # another user's, or removed meanwhile
-        os.utime(path)  # in use
+    digest, _, content = kept.partition(b"\n")
+    if digest != _digest(path, content):
+        logger.warning("%s is damaged, or others can write to it: it is made again", path)
+        return None
     try:
-        return CompileResult._rebuild(context, *pickle.loads(kept))
-    except (ImportError, AttributeError):  # kept for a type that has moved or is no more
-        return None
-    except (pickle.UnpicklingError, EOFError):
-        logger.warning("%s is damaged and made again", path)
+        return CompileResult._rebuild(context, *pickle.loads(content))
+    except (ImportError, AttributeError):  # of a type that has moved, or of another numpy
         return None
 
 
-def _remove_unused(folder: Path) -> None:
-    """Remove machine code that was not loaded for a long time."""
-    for path in folder.glob("*.machine-code"):
-        with contextlib.suppress(OSError):  # another user's, or removed meanwhile
-            if time.time() - path.stat().st_mtime > KEPT_FOR:
-                path.unlink()
+def _is_private(path: Path) -> bool:
+    """Return whether a file or folder is the user's, and nobody else can write to it."""
+    if os.name == "nt":  # which has other rights, and a cache of each user
+        return True
+    status = path.stat()
+    return status.st_uid == os.getuid() and not status.st_mode & 0o022
 
 
-def _say_compiling() -> None:
-    """Say once what takes long now, and how long."""
-    if not compiling_is_said.is_set():
-        compiling_is_said.set()
-        logger.warning("Compiling the estimator, once on this machine: about 10 s, the MHE 25 s")
+def _digest(path: Path, content: bytes) -> bytes:
+    """Return the digest of machine code in the file of a name."""
+    return hashlib.sha256(path.name.encode() + content).hexdigest().encode()
 
 
 @cache
 def _say_not_kept(folder: Path, problem: str | None) -> None:
     """Say once that machine code cannot be kept in a folder."""
     logger.warning(
-        "%s cannot keep machine code (%s): set NUMBA_CACHE_DIR to another folder", folder, problem
+        "%s cannot keep machine code (%s): "
+        "set NUMBA_CACHE_DIR to a folder that only you can write to",
+        folder,
+        problem,
     )
 
 
