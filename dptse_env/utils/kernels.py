@@ -233,10 +233,7 @@ def _loaded(path: Path, context: Any) -> Any:
     if digest != _digest(path, content):
         logger.warning("%s is damaged, or others can write to it: it is made again", path)
         return None
-    try:
-        return CompileResult._rebuild(context, *pickle.loads(content))
-    except (ImportError, AttributeError):  # of a type that has moved, or of another numpy
-        return None
+    return CompileResult._rebuild(context, *pickle.loads(content))
 
 
 def _is_private(path: Path) -> bool:
@@ -264,14 +261,14 @@ def _say_not_kept(folder: Path, problem: str | None) -> None:
 
 
 def _spelled(kind: Any) -> str:
-    """Write a type of numba; the name of a named tuple's leaves out its module and fields."""
+    """Write a type of numba, whose own name leaves out modules and fields."""
     if isinstance(kind, types.StructRef):
-        return f"{type(kind).__qualname__}{[_spelled(field) for _, field in kind._fields]}"
+        return f"{type(kind)}{[_spelled(field) for _, field in kind._fields]}"
     if not isinstance(kind, types.BaseTuple):
         return str(kind)
     cls, names = getattr(kind, "instance_class", tuple), getattr(kind, "fields", ())
     elements = [_spelled(element) for element in cast("Any", kind)]
-    return f"{cls.__module__}.{cls.__qualname__}{names}({', '.join(elements)})"
+    return f"{cls}{names}({', '.join(elements)})"
 
 
 @cache
@@ -283,7 +280,7 @@ def fingerprint(function: FunctionType) -> str:
         if following in seen:
             continue
         seen.add(following)
-        # Machine code imports the module.
+        # Machine code refers to functions and types by module and name.
         digest.update(repr((following.__module__, following.__defaults__)).encode())
         for code in _codes(following.__code__):
             constants = [c for c in code.co_consts if not isinstance(c, CodeType)]
@@ -313,7 +310,7 @@ def _used(function: FunctionType, code: CodeType) -> Iterator[Any]:
         if callable(value):
             inside = inspect.unwrap(value)
             yield inside if isinstance(inside, FunctionType) else inside.__module__
-            yield getattr(value, "_fields", None)
+            yield getattr(inside, "__qualname__", None), getattr(value, "_fields", None)
             options = getattr(value, "targetoptions", {})
             # In the same order in each process; some are sets.
             yield sorted((k, sorted(v) if isinstance(v, set) else v) for k, v in options.items())

@@ -1,7 +1,6 @@
 """Compiled functions: what is kept on disk, when it is compiled anew, and what is said then."""
 
 import gc
-import hashlib
 import importlib
 import logging
 import os
@@ -17,18 +16,19 @@ from numba.core.errors import TypingError
 from dptse_env.utils import kernels
 from dptse_env.utils.kernels import fingerprint
 
-MODULE = """
+PAIR = """
+class Pair(NamedTuple):
+    first: float
+    second: float
+"""
+MODULE = f"""
 from typing import NamedTuple
 
 from dptse_env.utils.kernels import kernel, kernel_part
 
 FACTOR = 2.0
 
-
-class Pair(NamedTuple):
-    first: float
-    second: float
-
+{PAIR}
 
 @kernel_part
 def scaled(x):
@@ -77,6 +77,7 @@ CHANGES = {
     "a number in a part": ("x * FACTOR", "x * 5.0 * FACTOR"),
     "the kernel": (".first", ".second"),
     "a named tuple": ("second: float", "other: float"),
+    "the name of a type": (PAIR, PAIR.replace("Pair", "Two") + "\n\nPair = Two\n"),
     "a default": ("def scaled(x)", "def scaled(x, y=1.0)"),
     "how a part is compiled": ("@kernel_part", '@kernel_part(fastmath={"contract", "nnan"})'),
 }
@@ -117,41 +118,28 @@ def test_a_kernel_is_kept_on_disk_and_compiled_anew_when_a_part_changes(fresh):
 
 
 class Harm:
-    """What makes a folder when it is unpickled."""
-
-    def __init__(self, folder):
-        self.folder = folder
+    """What fails the test when it is unpickled."""
 
     def __reduce__(self):
-        return os.mkdir, (self.folder,)
-
-
-def whole(name, content):
-    """Return the content of a file of a name that is not damaged."""
-    return hashlib.sha256(name.encode() + content).hexdigest().encode() + b"\n" + content
+        return pytest.fail, ("it was unpickled",)
 
 
 DAMAGES = {
     "cut": lambda content, _: content[:-1],
     "flipped": lambda content, _: content[:999] + bytes([content[999] ^ 1]) + content[1000:],
     "empty": lambda *_: b"",
-    "foreign": lambda _, harm: harm,
-    "another file's": lambda _, harm: whole("another", harm),
+    "another file's": lambda _, other: other,
+    "foreign": lambda *_: pickle.dumps(Harm()),
 }
 
 
-@pytest.fixture
-def harm(tmp_path):
-    """Return a pickle that does harm, and fail if it was done."""
-    yield pickle.dumps(Harm(str(tmp_path / "harm")))
-    assert not (tmp_path / "harm").exists()
-
-
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_file_is_made_again_and_not_unpickled(fresh, kept, harm, damage, caplog):
+def test_a_damaged_file_is_made_again_and_not_unpickled(fresh, kept, damage, caplog):
+    fresh(MODULE.replace("FACTOR = 2.0", "FACTOR = 4.0"))
+    (other,) = kept.iterdir()
     fresh()
-    (file,) = kept.iterdir()
-    file.write_bytes(DAMAGES[damage](file.read_bytes(), harm))
+    (file,) = set(kept.iterdir()) - {other}
+    file.write_bytes(DAMAGES[damage](file.read_bytes(), other.read_bytes()))
     assert fresh() == (3.0, 0)
     assert caplog.messages == [f"{file} is damaged, or others can write to it: it is made again"]
     assert fresh() == (3.0, 1)
@@ -167,28 +155,24 @@ def test_a_folder_in_the_place_of_a_file_makes_way(fresh, kept):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such modes")
-@pytest.mark.parametrize("mode", [0o020, 0o002])
-def test_machine_code_that_others_can_write_to_is_not_unpickled(
-    fresh, kept, harm, mode, caplog, monkeypatch
-):
+@pytest.mark.parametrize("right", [0o020, 0o002])
+def test_machine_code_that_others_can_write_to_is_not_used(fresh, kept, right, caplog, monkeypatch):
     fresh()
     (file,) = kept.iterdir()
-    file.write_bytes(whole(file.name, harm))
-    file.chmod(0o600 | mode)
+    file.chmod(0o600 | right)
     assert fresh() == (3.0, 0)
     assert fresh() == (3.0, 1)  # it is made again
     caplog.clear()
-    file.write_bytes(whole(file.name, harm))
-    kept.chmod(0o700 | mode)
+    kept.chmod(0o700 | right)
     assert fresh() == fresh() == (3.0, 0)
     kept.chmod(0o700)
+    assert fresh() == (3.0, 1)
     monkeypatch.setattr(os, "getuid", lambda: kept.stat().st_uid + 1)
     assert fresh() == (3.0, 0)
     assert caplog.messages == [
         f"{kept} cannot keep machine code (others can write to it): "
         "set NUMBA_CACHE_DIR to a folder that only you can write to"
     ]
-    assert file.read_bytes() == whole(file.name, harm)
 
 
 def test_machine_code_is_that_of_the_types_of_arguments(load):
@@ -266,9 +250,13 @@ def test_processes_may_compile_a_kernel_at_once(load, fresh, kept):
 
 def test_garbage_is_collected_as_before_where_compiling_fails(load):
     usual = gc.get_threshold()
-    with pytest.raises(TypingError, match="nothing"):
-        load(MODULE.replace("x * FACTOR", "x.nothing")).run(1.5)
-    assert gc.get_threshold() == usual
+    gc.set_threshold(700, 5, 5)
+    try:
+        with pytest.raises(TypingError, match="nothing"):
+            load(MODULE.replace("x * FACTOR", "x.nothing")).run(1.5)
+        assert gc.get_threshold() == (700, 5, 5)
+    finally:
+        gc.set_threshold(*usual)
 
 
 def test_a_part_runs_as_python_when_python_calls_it(load):
