@@ -9,6 +9,7 @@ run beside them.
 from __future__ import annotations
 
 import platform
+import traceback
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -18,6 +19,7 @@ from typing import Literal, get_args
 
 from agents.tables import markdown
 from benchmarks.turns import HEADER, Line, as_cells, measure, show
+from dptse_env.utils.files import write_atomically
 from dptse_env.utils.threads import n_cores
 from scripts.cli import run
 
@@ -27,29 +29,43 @@ PACKAGES = ("dptse-env", "libsumo", "gymnasium", "numba", "numpy", "stable-basel
 
 @dataclass(frozen=True)
 class Args:
-    """Measure and print one table."""
+    """Measure and print a table for each part."""
 
     parts: tuple[Part, ...] = get_args(Part)
     """Parts to measure."""
     output: Path | None = None
-    """File for the table, as Markdown."""
+    """File for one table of all parts, as Markdown."""
     quick: bool = False
     """Smallest sizes: whether it runs, not how fast it is."""
 
 
 def main(args: Args) -> None:
-    """Measure and print."""
-    lines: list[Line] = []
-    for part in args.parts:
-        with ProcessPoolExecutor(1, get_context("spawn")) as alone:
-            lines += alone.submit(measure, part, args.quick).result()
+    """Measure, and print and write what there is after each part.
+
+    Raises:
+        SystemExit: A part failed; the others were measured.
+    """
     versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     title = f"Python {platform.python_version()}, {n_cores()} cores; {versions}"
-    show(title, lines)
     if args.output is not None:
-        table = markdown(HEADER, map(as_cells, lines), ":--", "--:")
         args.output.parent.mkdir(parents=True, exist_ok=True)
-        args.output.write_text(f"# Time of a step\n\n{title}\n\n{table}\n", encoding="utf-8")
+    lines: list[Line] = []
+    failed: list[str] = []
+    for part in args.parts:
+        try:
+            with ProcessPoolExecutor(1, get_context("spawn")) as alone:
+                measured = alone.submit(measure, part, args.quick).result()
+        except Exception:
+            traceback.print_exc()
+            failed.append(part)
+            continue
+        show(f"{part}: {title}", measured)
+        lines += measured
+        if args.output is not None:
+            table = markdown(HEADER, map(as_cells, lines), ":--", "--:")
+            write_atomically(args.output, f"# Time of a step\n\n{title}\n\n{table}\n")
+    if failed:
+        raise SystemExit(f"error: {', '.join(failed)} failed, see above")
 
 
 if __name__ == "__main__":

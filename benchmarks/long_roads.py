@@ -55,18 +55,18 @@ def measure(*, quick: bool = False) -> list[Line]:
     lengths, n_steps, block, rounds = ((16, 21), 6, 3, 2) if quick else ((30, 60, 120), 60, 10, 12)
     work, bases = {}, {}
     for n in lengths:
+        road = long_road(n)
+        if quick:
+            road = replace(road, duration=60, incident=None)
         with quietly():
             env = gym.make_vec(
-                "dptse_env:dptse/PaperHighway-v0", num_envs=1, threads=1, corridor=long_road(n),
+                "dptse_env:dptse/PaperHighway-v0", num_envs=1, threads=1, corridor=road,
                 parameters="w99-3lane", bandwidth=n // 3, traffic_seeds=[0],
             )  # fmt: skip
         assert isinstance(env, SensorQueryVectorEnv)
         config, calls = env.config, tapped_calls(env, n_steps)
         for name in ESTIMATORS:
             settings = replace(config, estimator=name).settings()
-            # The network is asked for on roads that it was not trained on.
-            recurrent = replace(settings.recurrent, outside=True)
-            settings = replace(settings, recurrent=recurrent)
             replay = Replay(name, "compiled", env, calls, settings)
             what, base = (f"{LABELS[name]}, {each} segments" for each in (n, lengths[0]))
             work[what] = partial(replay.turn, block)

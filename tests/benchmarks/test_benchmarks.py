@@ -2,15 +2,18 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.turns import compare, take_turns
+from agents.executors import ThisProcess
+from benchmarks import __main__ as benchmarks
+from benchmarks import long_roads
+from benchmarks.turns import Line, compare, take_turns
 from tests.helpers import SHORT
 
 ROOT = Path(__file__).parents[2]
@@ -26,18 +29,20 @@ def run(*words):
     return done.stdout
 
 
-def test_turns_alternate_and_set_up_is_off_the_clock():
+def test_turns_alternate_and_set_up_is_off_the_clock(monkeypatch):
     log = []
     work = {"a": lambda: log.append("a") or 1, "b": lambda: log.append("b") or 2}
 
-    def prepare():
-        log.append("-")
-        time.sleep(0.05)
+    def clock():
+        log.append("clock")
+        return float(len(log))
 
-    times = take_turns(work, 2, prepare)
-    assert log == ["-", "a", "b"] * 3
-    assert times["a"].shape == (2,)  # the first round compiles
-    assert times["a"].max() < 5e4
+    monkeypatch.setattr("time.perf_counter", clock)
+    times = take_turns(work, 2, lambda: log.append("-"))
+    assert log == ["-", "clock", "a", "clock", "clock", "b", "clock"] * 3
+    assert {name: found.tolist() for name, found in times.items()} == {
+        "a": [2e6] * 2, "b": [1e6] * 2,
+    }  # fmt: skip
 
 
 def test_a_ratio_pairs_the_turns_of_a_round():
@@ -47,6 +52,24 @@ def test_a_ratio_pairs_the_turns_of_a_round():
     assert fast.ratio is None
     assert (slow.time, slow.base) == (2.2, "fast")
     assert slow.ratio.low == pytest.approx(2.0) == slow.ratio.high
+
+
+def test_a_part_that_fails_loses_nothing_of_the_others(tmp_path, monkeypatch, capsys):
+    def measure(part, quick):
+        return [Line(f"a step of {part}", 1.0)] if part != "environment" else {}[part]
+
+    monkeypatch.setattr(benchmarks, "measure", measure)
+    monkeypatch.setattr(benchmarks, "ProcessPoolExecutor", lambda *_: ThisProcess())
+    path = tmp_path / "new" / "tables.md"
+    with pytest.raises(SystemExit, match=r"environment failed"):
+        benchmarks.main(benchmarks.Args(output=path))
+    for said in (capsys.readouterr().out, path.read_text(encoding="utf-8")):
+        assert re.findall(r"a step of (\w+)", said) == ["estimators", "learning", "long_roads"]
+
+
+def test_long_roads_have_settings_of_all_estimators():
+    lines = long_roads.measure(quick=True)
+    assert [line.base for line in lines] == [""] * 6 + [line.what for line in lines[:6]]
 
 
 @pytest.mark.slow
