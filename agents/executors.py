@@ -303,7 +303,7 @@ def run_shown(
     executor: AnyExecutor,
     work: Callable[[TaskT], ResultT],
     tasks: Sequence[TaskT],
-    take: Callable[[TaskT, ResultT], None],
+    take: Callable[[int, ResultT], None],
     *,
     size: Callable[[TaskT], int] = lambda task: 1,
     progress: bool = True,
@@ -311,14 +311,13 @@ def run_shown(
 ) -> None:
     """Run tasks with a progress bar, and hand over each result as it comes, in whatever order.
 
-    Nothing is kept of a task that is done. What still runs is ended where anything goes wrong, and
-    on Ctrl-C.
+    No result is kept. What still runs is ended where anything goes wrong, and on Ctrl-C.
 
     Args:
         executor: Runs the tasks.
         work: Runs one; a function that workers can import.
         tasks: The tasks; they can be pickled.
-        take: Called with each task and its result.
+        take: Called with the index of each task in `tasks` and its result.
         size: Units of the bar that a task stands for.
         progress: Whether to show the bar.
         bar: Further options of `tqdm`.
@@ -326,18 +325,18 @@ def run_shown(
     Raises:
         ExecutorError: Workers died again and again. Errors of ``work`` are raised as they are.
     """
-    waiting, running = iter(tasks), dict[Future[ResultT], TaskT]()
+    waiting, running = iter(enumerate(tasks)), dict[Future[ResultT], int]()
     with tqdm(total=sum(map(size, tasks)), disable=not progress, **bar) as shown:
         try:
             while True:
-                for task in islice(waiting, max(executor.ahead - len(running), 0)):
-                    running[executor.submit(work, task)] = task
+                for index, task in islice(waiting, max(executor.ahead - len(running), 0)):
+                    running[executor.submit(work, task)] = index
                 if not running:
                     return
                 for future in wait(running, LONGEST_WAIT, FIRST_COMPLETED).done:
-                    task = running.pop(future)
-                    take(task, future.result())
-                    shown.update(size(task))
+                    index = running.pop(future)
+                    take(index, future.result())
+                    shown.update(size(tasks[index]))
         except BaseException:
             executor.shutdown(cancel_futures=True)
             raise
@@ -355,12 +354,11 @@ def run_in_order(
     ``on_done`` is called after each with the fraction of them that is done, ``options`` are those
     of `run_shown`.
     """
-    places = {id(task): place for place, task in enumerate(tasks)}
     results: dict[int, ResultT] = {}
 
-    def take(task: TaskT, result: ResultT) -> None:
-        results[places[id(task)]] = result
+    def take(index: int, result: ResultT) -> None:
+        results[index] = result
         on_done(len(results) / len(tasks))
 
     run_shown(executor, work, tasks, take, **options)
-    return [results[place] for place in range(len(tasks))]
+    return [results[index] for index in range(len(tasks))]

@@ -150,7 +150,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
         place.executor,
         partial(_play_cell, study.name, place.records, threads),
         missing,
-        lambda task, rows: write_table(_file_of(folder, task[0].id), rows),
+        lambda index, rows: write_table(_file_of(folder, missing[index][0].id), rows),
         size=lambda task: len(task[1]),
         progress=progress and bool(missing),
         desc=study.name,

@@ -140,9 +140,11 @@ def main(args: Args) -> None:
             last[tasks[0][1]] = train(tasks[0], args.records, executor)
         else:
             work = partial(train, records=args.records)
-            run_shown(
-                executor, work, tasks, lambda task, row: last.update({task[1]: row}), progress=False
-            )
+
+            def take(index: int, row: Row) -> None:
+                last[tasks[index][1]] = row
+
+            run_shown(executor, work, tasks, take, progress=False)
     table = make_table("on validation traffic", "training", "error x 1000", "on sections", "chi2")
     for folder, row in sorted(last.items()):
         errors = [f"{1000 * row[name]:.1f}" for name in ("validation", "sections") if name in row]

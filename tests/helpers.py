@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterable
+import time
+from collections.abc import Callable, Collection, Iterable
 from itertools import combinations, product
 from typing import Any
 
@@ -60,6 +61,18 @@ def pairwise(*axes: Iterable[Any], n: int = 6, rest: bool = True) -> list[Any]:
 def _parameter(case: Any, slow: bool) -> Any:
     values = case if isinstance(case, tuple) else (case,)
     return pytest.param(*values, marks=[pytest.mark.slow] if slow else [])
+
+
+# --- other processes ------------------------------------------------------------------------------
+
+
+def wait_for(condition: Callable[[], Any]) -> None:
+    """Wait until a condition holds; five minutes or more pass before that is given up."""
+    for _ in range(30_000):
+        if condition():
+            return
+        time.sleep(0.01)
+    raise AssertionError("waited in vain")
 
 
 # --- environments on the short road ---------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 import pickle
 import threading
-import time
 import warnings
 
 import gymnasium as gym
@@ -83,20 +82,24 @@ def test_threads_change_nothing(estimator):
         assert_same(one.step(actions), two.step(actions))
 
 
-@pytest.mark.parametrize(("estimator", "threads", "n_names"), [("ekf", 1, 1), ("enkf", 2, 2)])
-def test_compiled_estimators_work_on_so_many_threads(estimator, threads, n_names, monkeypatch):
+@pytest.mark.parametrize(("estimator", "threads", "n"), [("ekf", 1, 1), ("enkf", 2, 2)])
+def test_compiled_estimators_work_on_so_many_threads(estimator, threads, n, monkeypatch):
     env = make_batch(2 * SMALLEST_BLOCK, estimator=estimator, threads=threads)
     env.reset(seed=0)
-    names, predict = set(), env.process.estimator.predict
+    names, predict, together = (
+        set(),
+        env.process.estimator.predict,
+        threading.Barrier(n, timeout=300.0),
+    )
 
     def watched(episodes, inputs):
+        together.wait()
         names.add(threading.current_thread().name)
-        time.sleep(0.02)
         predict(episodes, inputs)
 
     monkeypatch.setattr(env.process.estimator, "predict", watched)
     env.step(env.action_space.sample())
-    assert len(names) == n_names
+    assert len(names) == n
 
 
 # --- what scalar environments do not have ---------------------------------------------------------

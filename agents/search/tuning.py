@@ -201,7 +201,7 @@ def tune(search: Search, folder: Path, n_trials: int, executor: AnyExecutor) -> 
     starts = dict(enumerate(search.starts().items()))
     tasks = [(index, starts.get(index)) for index in range(n_finished(study), n_trials)]
     work = partial(_run_trial, search, folder)
-    run_shown(executor, work, tasks, lambda task, _: None, desc=search.name, unit="trial")
+    run_shown(executor, work, tasks, lambda *done: None, desc=search.name, unit="trial")
     return study
 
 

@@ -177,8 +177,8 @@ def train_all(
     work = partial(_train_there, records=records, threads=threads)
     tasks = [(plan, folder.absolute()) for folder, plan in plans.items()]
 
-    def take(task: tuple[TrainingPlan, Path], _: None) -> None:
-        require_trained(task[1], POLICY)
+    def take(index: int, _: None) -> None:
+        require_trained(tasks[index][1], POLICY)
 
     run_shown(executor, work, tasks, take, progress=progress, desc="training", unit="training")
 

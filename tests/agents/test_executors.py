@@ -1,10 +1,14 @@
+import io
 import operator
 import os
 import signal
+import subprocess
 import sys
-import time
+import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
+import loky
 import pytest
 
 from agents.executors import (
@@ -17,6 +21,7 @@ from agents.executors import (
 )
 from dptse_env.utils.kernels import compiling_is_said
 from dptse_env.utils.registry import MissingExtraError
+from tests.helpers import wait_for
 
 
 def run(executor, work, tasks):
@@ -30,27 +35,43 @@ def reciprocal(number):
 @pytest.mark.parametrize("kind", [ThisProcess, lambda: LocalProcesses(2)])
 def test_tasks_come_back_with_their_results_and_errors_as_they_are(kind):
     executor, done = kind(), []
-    assert run(executor, operator.neg, range(9)) == [-k for k in range(9)]
+    assert run(executor, operator.neg, range(300, 306)) == [-k for k in range(300, 306)]
     assert run(executor, operator.neg, []) == []
-    assert run_in_order(executor, operator.neg, [3, 1], done.append, progress=False) == [-3, -1]
-    assert done == [0.5, 1.0]
+    again = run_in_order(executor, operator.neg, [1, 1, 2, 1], done.append, progress=False)
+    assert (again, done) == ([-1, -1, -2, -1], [0.25, 0.5, 0.75, 1.0])
     with pytest.raises(ZeroDivisionError):
         run(executor, reciprocal, [1, 0, 2])
 
 
-def test_a_result_is_handed_over_before_the_next_task_begins():
-    seen = []
+def test_results_are_in_the_order_of_the_tasks_whichever_is_done_first():
+    second_is_taken = threading.Event()
 
     def work(number):
-        seen.append(("begun", number))
-        return number
+        return number if number == 2 else second_is_taken.wait() and number
 
-    run_shown(ThisProcess(), work, [1, 2], lambda task, _: seen.append(("taken", task)))
-    assert seen == [("begun", 1), ("taken", 1), ("begun", 2), ("taken", 2)]
+    with ThreadPoolExecutor(2) as executor:
+        executor.ahead = 2
+        taken = [1, 2], lambda fraction: second_is_taken.set()
+        assert run_in_order(executor, work, *taken, progress=False) == [1, 2]
 
 
-def place(number):
-    time.sleep(0.1)
+def test_a_result_is_handed_over_before_the_next_task_begins_and_the_bar_has_its_size():
+    seen, bar = [], io.StringIO()
+
+    def work(task):
+        seen.append(("begun", task))
+        return -len(task)
+
+    tasks = [range(2), range(3)]
+    run_shown(ThisProcess(), work, tasks, lambda *done: seen.append(done), size=len, file=bar)
+    assert seen == [("begun", range(2)), (0, -2), ("begun", range(3)), (1, -3)]
+    assert "5/5" in bar.getvalue()
+
+
+def meet(folder):
+    """Wait for another process that does the same; return this one."""
+    (folder / str(os.getpid())).touch()
+    wait_for(lambda: len(list(folder.iterdir())) >= 2)
     return os.getpid()
 
 
@@ -59,11 +80,11 @@ def interrupted(number):
     return number
 
 
-def test_there_are_as_many_processes_as_asked_for_and_they_leave_interrupts_to_this_one():
+def test_there_are_as_many_processes_as_asked_for_and_they_leave_interrupts_to_this_one(tmp_path):
     executor = LocalProcesses(2)
-    places = set(run(executor, place, range(8)))
-    assert len(places) <= 2
-    assert os.getpid() not in places
+    places = run(executor, meet, [tmp_path] * 8)
+    assert {str(place) for place in places} == {each.name for each in tmp_path.iterdir()}
+    assert len({*places} - {os.getpid()}) == 2
     assert run(executor, interrupted, range(2)) == [0, 1]
 
 
@@ -77,17 +98,36 @@ def is_said(_):
     return compiling_is_said.is_set()
 
 
-def test_processes_do_not_repeat_what_this_one_has_said():
-    assert run(LocalProcesses(2), n_warnings, ["dptse_env.config", "torch"]) == [0, 1]
+def test_processes_have_one_thread_and_do_not_repeat_what_this_one_has_said(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
     compiling_is_said.set()
-    assert run(LocalProcesses(2), is_said, [1]) == [True]
+    executor = LocalProcesses(2)
+    assert run(executor, n_warnings, ["dptse_env.config", "torch"]) == [0, 1]
+    assert run(executor, is_said, [1]) == [True]
+    assert run(executor, os.getenv, ["OMP_NUM_THREADS"]) == ["1"]
 
 
-def dies(number):
-    if number == 3:
-        os.kill(os.getpid(), 9)
-    time.sleep(0.01)
-    return number
+def test_a_task_whose_worker_died_runs_again_three_times(monkeypatch):
+    """With processes in this one, which die as often as they should."""
+
+    class Mortal(ThisProcess):
+        deaths = 3
+
+        def __init__(self, *_, **__):
+            pass
+
+        def submit(self, call):
+            if type(self).deaths:
+                type(self).deaths -= 1
+                raise loky.BrokenProcessPool
+            return super().submit(call)
+
+    monkeypatch.setattr(loky, "ProcessPoolExecutor", Mortal)
+    assert run(LocalProcesses(2), abs, [-1]) == [1]
+    Mortal.deaths = 4
+    with pytest.raises(ExecutorError, match="a task was lost 4 times"):
+        run(LocalProcesses(2), abs, [-1])
+    assert Mortal.deaths == 0
 
 
 def dies_once(task):
@@ -99,31 +139,47 @@ def dies_once(task):
 
 
 @pytest.mark.slow
-def test_a_task_whose_worker_died_runs_again_three_times(tmp_path):
+def test_a_worker_that_dies_is_replaced(tmp_path):
     tasks = [(number, tmp_path / "trace") for number in range(8)]
     assert run(LocalProcesses(2), dies_once, tasks) == list(range(8))
-    with pytest.raises(ExecutorError, match="a task was lost 4 times"):
-        run(LocalProcesses(2), dies, range(8))
-    assert run(LocalProcesses(2), abs, [-1]) == [1]
 
 
-@pytest.mark.slow
-def test_an_error_ends_what_still_runs():
-    start = time.monotonic()
-    with pytest.raises(ZeroDivisionError):
-        run(LocalProcesses(2), sleep_or_fail, [0.0, *[60.0] * 5])
-    assert time.monotonic() - start < 30.0
+PROGRAM = """
+import sys
+from agents.executors import LocalProcesses, run_in_order
+run_in_order(LocalProcesses(2), exec, sys.argv[1:], progress=False)
+"""
+TASK = """
+import os, pathlib, time
+folder = pathlib.Path({folder!r})
+(folder / str(os.getpid())).touch()
+while {forever} or len(list(folder.iterdir())) < 2:
+    time.sleep(0.01)
+1 / 0
+"""
 
 
-def sleep_or_fail(seconds):
-    time.sleep(seconds)
-    return 1 / seconds
+@pytest.mark.parametrize("one_fails", [False, True])
+def test_what_still_runs_is_ended_where_another_fails_or_the_program_is_killed(tmp_path, one_fails):
+    tasks = [TASK.format(folder=str(tmp_path), forever=each) for each in (True, not one_fails)]
+    command = [sys.executable, "-c", PROGRAM, *tasks]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as program:
+        try:
+            if not one_fails:
+                wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
+                program.kill()
+            # The pipe is open as long as there is any process.
+            assert ("ZeroDivisionError" in program.communicate(timeout=300)[1]) == one_fails
+        finally:
+            program.kill()
 
 
-@pytest.mark.parametrize("workers", [0, 1.5])
-def test_the_number_of_processes_is_checked(workers):
-    with pytest.raises(ValueError, match="workers must be an integer >= 1"):
-        make_executor("local", workers)
+def test_one_worker_is_the_calling_process():
+    assert isinstance(make_executor("local", 1), ThisProcess)
+    assert make_executor("local", 2).workers == 2
+    for workers in (0, 1.5):
+        with pytest.raises(ValueError, match="workers must be an integer >= 1"):
+            make_executor("local", workers)
 
 
 def test_an_address_belongs_to_a_cluster():

@@ -23,41 +23,45 @@ def test_every_row_is_worked_on_once(threads, n_rows):
     assert (seen == 1).all()
 
 
-def test_large_batches_use_the_threads_and_small_ones_do_not():
-    names = set()
+def workers(blocks, n_rows=2 * SMALLEST_BLOCK, n_threads=2):
+    """Return the threads that work at the same time."""
+    together, found = threading.Barrier(n_threads, timeout=300.0), []
 
     def work(rows):
-        names.add(threading.current_thread().name)
-        time.sleep(0.01)
+        together.wait()
+        found.append(threading.current_thread())
 
-    blocks = EpisodeThreads(2)
-    blocks.run(2 * SMALLEST_BLOCK - 1, work)
-    assert names == {threading.current_thread().name}
-    blocks.run(2 * SMALLEST_BLOCK, work)
-    assert len(names) == 2
+    blocks.run(n_rows, work)
+    return {*found}
+
+
+def test_large_batches_use_the_threads_and_small_ones_do_not():
+    blocks, here = EpisodeThreads(2), threading.current_thread()
+    assert workers(blocks, 2 * SMALLEST_BLOCK - 1, n_threads=1) == {here}
+    assert len(workers(blocks) - {here}) == 1
 
 
 @pytest.mark.parametrize("own", [True, False])
 def test_an_exception_is_raised_once_nobody_works_any_more(own):
-    running = []
-    here = threading.current_thread()
+    here, together, ended = threading.current_thread(), threading.Barrier(2, timeout=300.0), []
 
     def work(rows):
-        running.append(rows)
-        fails = own == (threading.current_thread() is here)
-        time.sleep(0.01 if fails else 0.03)
-        running.remove(rows)
-        if fails:
+        together.wait()
+        if own == (threading.current_thread() is here):
             raise ZeroDivisionError
+        time.sleep(0.05)  # long enough to be seen if nobody waits
+        ended.append(rows)
 
     with pytest.raises(ZeroDivisionError):
         EpisodeThreads(2).run(2 * SMALLEST_BLOCK, work)
-    assert not running
+    assert len(ended) == 1
 
 
-def test_the_threads_stay_behind_when_it_travels():
+def test_the_threads_stay_behind_when_it_travels(monkeypatch):
     blocks = EpisodeThreads(2)
-    blocks.run(2 * SMALLEST_BLOCK, lambda rows: None)
+    before = workers(blocks)
     assert pickle.loads(pickle.dumps(blocks)).threads == 2
+    monkeypatch.setattr("os.getpid", lambda: -1)  # as in a process that was forked
+    assert workers(blocks) & before == {threading.current_thread()}
     with pytest.raises(ValueError, match="threads must be"):
         EpisodeThreads(0)

@@ -157,8 +157,8 @@ def _train_missing(
             check_plan(each.folder(study), plan_of(each, study, minutes).content())
     missing = [(each, rules[each.setting]) for each in trainings if not each.is_finished(study)]
 
-    def take(task: tuple[Training, Any], _: None) -> None:
-        require_trained(task[0].folder(study), CURVE)
+    def take(index: int, _: None) -> None:
+        require_trained(missing[index][0].folder(study), CURVE)
         keep_curves(study)
 
     work = partial(_train_there, study=study, minutes=minutes, records=place.records)
