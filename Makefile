@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo pictures reproduce audit test test-slow mutants test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
+.PHONY: help setup docs site dist demo pictures reproduce audit test test-slow test-fresh mutants test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -62,6 +62,9 @@ test-tutorial: setup  ## Run the tutorial as a notebook, two to four minutes.
 
 test-slow: setup  ## Run the slow tests: before a release, and after a change to kernels, workers or benchmarks.
 	$(BIN)/python -m pytest -m 'slow and not ray' -n 2 --dist loadfile
+
+test-fresh: setup  ## Run the tests of properties with examples that are drawn anew.
+	$(BIN)/python -m pytest -m 'hypothesis and not slow' --hypothesis-profile fresh
 
 mutants: setup  ## Break each line of the proof in a copy, and see a fast test fail; a quarter of an hour.
 	$(BIN)/python -m tests.mutants

@@ -1,18 +1,30 @@
+"""The same variables, examples and folders for all tests, whatever the machine has."""
+
 import gc
 import os
 
-# Before anything imports numpy or torch: their threads would fight over the cores of the tests.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-from pathlib import Path
-
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-# The first example of a compiled test compiles it: no time limit on a single example. What gates a
-# change draws the same examples each time; at a developer's desk they are new ones.
-settings.register_profile("compiled", deadline=None, derandomize="CI" in os.environ)
-settings.load_profile("compiled")
+LEFT = ("NUMBA_CACHE_DIR",)  # the place of machine code changes nothing
+CLEARED = (
+    "COLUMNS", "DPTSE_", "FORCE_COLOR", "JUPYTER_", "LINES", "MKL_", "MPLBACKEND", "NO_COLOR",
+    "NUMBA_", "OMP_", "OPENBLAS_", "PYGAME_", "PYTHONWARNINGS", "PYTHON_COLORS", "RAY_", "SDL_",
+    "SUMO_", "TQDM_", "TTY_",
+)  # fmt: skip
+"""Beginnings of variables that this package or a library reads; `test_variables` sets them."""
+
+# Before tests import numba, which reads them once, or torch, whose threads would fight over cores.
+for name in [*os.environ]:
+    if name.startswith(CLEARED) and name not in LEFT:
+        del os.environ[name]
+os.environ["OMP_NUM_THREADS"] = "1"
+
+# Time limits would depend on the machine, and the first example of a compiled test compiles it.
+TIMELESS = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+settings.register_profile("same", **TIMELESS, derandomize=True)
+settings.register_profile("fresh", **TIMELESS, derandomize=False, print_blob=True)
+settings.load_profile("same")
 
 
 def pytest_collection_finish():
@@ -23,11 +35,6 @@ def pytest_collection_finish():
 @pytest.fixture(scope="session", autouse=True)
 def record_cache(tmp_path_factory):
     """Keep every record that the tests make in a folder of their own, child processes too."""
-    folder: Path = tmp_path_factory.mktemp("records")
-    before = os.environ.get("DPTSE_CACHE")
+    folder = tmp_path_factory.mktemp("records")
     os.environ["DPTSE_CACHE"] = str(folder)
-    yield folder
-    if before is None:
-        del os.environ["DPTSE_CACHE"]
-    else:
-        os.environ["DPTSE_CACHE"] = before
+    return folder

@@ -741,7 +741,7 @@ def failed(copy: Path, tests: list[str], **environment: str) -> str:
         [sys.executable, "-m", "pytest", "-m", "not slow", "-x", "-q", "-p", "no:cacheprovider",
          *(f"tests/{test}" for test in tests)],
         cwd=copy, capture_output=True, text=True, timeout=MOST_SECONDS, check=False,
-        # Without CI hypothesis would try other examples each time, and pytest cut lines short.
+        # Without CI pytest would cut lines short.
         env={**os.environ, "PYTHONPATH": str(copy), "CI": "true", **environment},
     )  # fmt: skip
     if ended.returncode == 0:

@@ -1,0 +1,43 @@
+"""Variables of the environment, which no other test sees, do what they should or nothing."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import gymnasium as gym
+from agents.terminal import make_table, print_table
+env = gym.make("dptse_env:dptse/ShortHighway-v0", traffic_seeds=[0], horizon=4)
+env.reset(seed=0)
+env.action_space.seed(0)
+table = make_table("title", *["a heading of some words"] * 4)
+table.add_row(*[f"{env.step(env.action_space.sample())[1]:.9f}" for _ in range(4)])
+print_table(table)
+"""
+NO_EFFECT = {
+    "COLUMNS": "20", "LC_ALL": "C", "LINES": "5", "MPLBACKEND": "none", "NO_COLOR": "1",
+    "OMP_NUM_THREADS": "2", "PYTHONHASHSEED": "7", "RAY_ADDRESS": "10.0.0.1:1",
+    "SUMO_HOME": "/nowhere", "TERM": "dumb", "TQDM_DISABLE": "1", "TZ": "Asia/Kolkata",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("variables", [NO_EFFECT, {"FORCE_COLOR": "1", "COLUMNS": "20"}])
+def test_variables_change_colours_and_the_place_of_records_but_no_number(
+    variables, tmp_path, capsys
+):
+    exec(PROGRAM, {})
+    expected = capsys.readouterr().out
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True,
+        env={**os.environ, **variables, "DPTSE_CACHE": str(tmp_path)}, encoding="utf-8",
+    )  # fmt: skip
+    assert len(list(tmp_path.rglob("*.safetensors"))) == 1
+    if "FORCE_COLOR" in variables:  # as at a terminal, where narrow tables fold
+        assert "\x1b[" in done.stdout
+        numbers = (re.findall(r"\d\.\d{9}", said) for said in (done.stdout, expected))
+        assert [*next(numbers)] == [*next(numbers)]
+    else:
+        assert done.stdout == expected
