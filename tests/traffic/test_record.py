@@ -144,7 +144,7 @@ def test_a_saved_record_comes_back(content, tmp_path):
 
 
 @pytest.mark.parametrize("content", [TABLE, FIELD])
-def test_hostile_files_are_refused_soon_in_one_line_with_their_path(content, tmp_path):
+def test_hostile_files_are_refused_in_one_line_with_their_path(content, tmp_path):
     good = tmp_path / "good"
     Record(**content).save(good, SOURCE)
     load = partial(Record.load, source=SOURCE, shape=(content["n_steps"], content["n_columns"]))

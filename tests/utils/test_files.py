@@ -8,6 +8,8 @@ from threading import Thread
 import numpy as np
 import pytest
 
+from dptse_env.utils import fields
+from dptse_env.utils.fields import read_toml
 from dptse_env.utils.files import (
     read_tensors,
     replacing,
@@ -50,8 +52,16 @@ def test_the_same_content_gives_the_same_bytes(path, tmp_path):
     assert again.read_bytes() == path.read_bytes()
 
 
-def test_damage_is_refused_soon_and_in_little_memory(path, tmp_path):
+def test_damage_is_refused(path, tmp_path):
     check_hostile(read_tensors, path, tmp_path / "bad.safetensors", shapes=False)
+
+
+def test_what_is_too_large_is_refused_unread(path, monkeypatch):
+    monkeypatch.setattr(fields, "LARGEST_TOML", 8)
+    monkeypatch.delattr(Path, "read_bytes")
+    for read in (lambda: read_tensors(path, largest=8), lambda: read_toml(path, "road file")):
+        with pytest.raises(ValueError, match=r"good\.safetensors.* at most 8 bytes, got"):
+            read()
 
 
 @pytest.mark.parametrize(
