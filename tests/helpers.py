@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Collection, Iterable
 from itertools import combinations, product
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -73,6 +76,38 @@ def wait_for(condition: Callable[[], Any]) -> None:
             return
         time.sleep(0.01)
     raise AssertionError("waited in vain")
+
+
+ROOT = Path(__file__).parents[1]
+KILLED = """
+import os, pkgutil, runpy, signal, sys
+owner, name, calls, how, *sys.argv = sys.argv[1:]
+owner, left = pkgutil.resolve_name(owner), [int(calls)]
+function = getattr(owner, name)
+def counted(*args, **keywords):
+    result = function(*args, **keywords)
+    left[0] -= 1
+    if not left[0]:
+        os.kill(os.getpid(), int(how))
+    return result
+setattr(owner, name, counted)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+runpy.run_module(sys.argv[0], run_name="__main__")
+"""
+
+
+def run_killed(
+    owner: str, function: str, calls: int, *words: object, how: int = 9
+) -> subprocess.CompletedProcess[str]:
+    """Run a module as a program that sends itself a signal after some calls of a function.
+
+    Returns:
+        The program, when it and the processes that it has begun are gone.
+    """
+    command = [sys.executable, "-c", KILLED, owner, function, str(calls), str(int(how))]
+    return subprocess.run(
+        [*command, *map(str, words)], cwd=ROOT, capture_output=True, text=True, check=False
+    )
 
 
 # --- environments on the short road ---------------------------------------------------------------

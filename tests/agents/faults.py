@@ -6,6 +6,7 @@ python -m tests.agents.faults FOLDER [ADDRESS]
 import os
 import sys
 import time
+import uuid
 from pathlib import Path
 
 import polars as pl
@@ -29,7 +30,7 @@ class Disturbed(OldestFirst):
         return super().predict(observation, state, episode_start, deterministic)
 
     def disturb(self, traces):
-        (traces / f"played-{time.monotonic_ns()}").touch()
+        (traces / f"played-{uuid.uuid4()}").touch()
         time.sleep(0.3)
 
 

@@ -2,9 +2,7 @@
 
 import dataclasses
 import json
-import subprocess
 import sys
-import time
 import tomllib
 import warnings
 
@@ -26,7 +24,8 @@ from agents.study import Place
 from dptse_env.model import load_parameters
 from dptse_env.model.parameters import write_parameters
 from dptse_env.traffic import RecordLibrary, read_road, write_corridor
-from tests.scripts.commands import ROOT, refused, run_command
+from tests.helpers import run_killed
+from tests.scripts.commands import refused, run_command
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
 ROAD = """# my road
@@ -142,20 +141,14 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
 def test_a_killed_fit_goes_on_with_what_it_has_tried(tmp_path):
     path = tmp_path / "my-road.toml"
     path.write_text(ROAD)
-    command = [sys.executable, "-m", "scripts.dptse", "fit", str(path), *BRIEF, "--tries", "20"]
+    words = "fit", path, *BRIEF, "--tries", "20"
     kept = tmp_path / "my-road-fit" / "stages" / "search.json"
-    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
-        try:
-            deadline = time.monotonic() + 120
-            while not kept.exists() or len(json.loads(kept.read_text())) < 7:
-                assert time.monotonic() < deadline
-                assert process.poll() is None
-                time.sleep(0.02)
-        finally:
-            process.kill()
+    where = "agents.fitting.parameters", "write_json", 7
+    assert run_killed(*where, "scripts.dptse", *words).returncode == -9
     tried = json.loads(kept.read_text())
+    assert len(tried) == 7
     assert path.read_text() == ROAD
-    done = run_command(*command[3:])
+    done = run_command(*words)
     assert done.returncode == 0, done.stderr
     after = json.loads(kept.read_text())
     assert after[: len(tried)] == tried

@@ -1,13 +1,10 @@
 """The command: it trains, goes on, trains several seeds, and refuses."""
 
 import json
-import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -17,7 +14,7 @@ pytest.importorskip("tyro")
 
 from agents.training.run_files import read_progress
 from tests.agents.training.plans import SMALL, STEPS, without_time
-from tests.helpers import SHORT
+from tests.helpers import SHORT, run_killed
 from tests.scripts.commands import refused, run_command
 
 ROOT = Path(__file__).parents[2]
@@ -96,27 +93,17 @@ def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
 @pytest.mark.parametrize("how", [getattr(signal, "SIGKILL", None), signal.SIGINT])
 @pytest.mark.parametrize("algorithm", ["plackett-luce", "ppo"])
 def test_a_killed_program_goes_on(tmp_path, how, algorithm):
-    def start(output):
-        return subprocess.Popen(
-            [sys.executable, "-m", "scripts.dptse", "train", *words(output, algorithm)],
-            cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+    def start(output, n_checkpoints):
+        where = "agents.training.run", "write_checkpoint", n_checkpoints
+        given = words(tmp_path / output, algorithm)
+        return run_killed(*where, "scripts.dptse", "train", *given, how=how)
 
-    process = start(tmp_path / "killed")
-    deadline = time.monotonic() + 240
-    while not (tmp_path / "killed" / "checkpoint.pt").exists():
-        assert time.monotonic() < deadline, process.communicate(timeout=5)
-        time.sleep(0.01)
-    process.send_signal(how)
-    _, err = process.communicate(timeout=240)
-    assert process.returncode == (130 if how == signal.SIGINT else -how), err
-    assert how == signal.SIGKILL or "the same command goes on" in err
+    done = start("killed", 1)
+    assert done.returncode == (130 if how == signal.SIGINT else -how), done.stderr
+    assert how == signal.SIGKILL or "the same command goes on" in done.stderr
     curves = []
     for run in ("killed", "whole"):
-        process = start(tmp_path / run)
-        process.communicate(timeout=600)
-        assert process.returncode == 0
+        assert start(run, 1000).returncode == 0
         curves.append(without_time(read_progress(tmp_path / run)))
     assert [row["update"] for row in curves[0]] == [row["update"] for row in curves[1]]
     if algorithm == "plackett-luce":

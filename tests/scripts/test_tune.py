@@ -1,18 +1,12 @@
 import json
-import os
-import subprocess
 import sys
-import time
-from pathlib import Path
 
 import gymnasium as gym
 import pytest
 
 from agents.search.tuning import FINISHED
 from scripts.tune import Args, main
-from tests.helpers import SHORT
-
-ROOT = Path(__file__).parents[2]
+from tests.helpers import SHORT, run_killed
 
 
 def test_it_leaves_a_set_per_configuration(tmp_path, capsys):
@@ -36,31 +30,18 @@ def test_it_leaves_a_set_per_configuration(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no groups of processes")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows kills otherwise")
 def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
-    command = [
-        sys.executable, "-m", "scripts.dptse", "tune", "--env", SHORT, "--estimators", "ekf",
-        "--seeds", "0:2", "--trials", "16", "--workers", "2", "--output", str(tmp_path),
-    ]  # fmt: skip
+    words = (
+        "scripts.dptse", "tune", "--env", SHORT, "--estimators", "ekf", "--seeds", "0:2",
+        "--trials", "16", "--workers", "2", "--output", tmp_path,
+    )  # fmt: skip
     journal = tmp_path / "ekf-paper-paper.journal"
-    with subprocess.Popen(
-        command, cwd=ROOT, start_new_session=True, stderr=subprocess.DEVNULL
-    ) as process:
-        try:
-            deadline = time.monotonic() + 120
-            while not journal.exists() or finished(journal) < 4:
-                assert time.monotonic() < deadline
-                assert process.poll() is None
-                time.sleep(0.02)
-        finally:
-            process.kill()
-    deadline = time.monotonic() + 20
-    while group_lives(process.pid):
-        assert time.monotonic() < deadline, "workers outlive the run"
-        time.sleep(0.05)
-    assert finished(journal) < 16
+    assert run_killed("agents.executors:tqdm", "update", 4, *words).returncode == -9
+    n = finished(journal)
+    assert 4 <= n < 16
     assert not (tmp_path / "ekf-paper-paper.json").exists()
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    assert run_killed("agents.executors:tqdm", "update", 17 - n, *words).returncode == 0
     (content,) = json.loads((tmp_path / "ekf-paper-paper.json").read_text()).values()
     assert content["provenance"]["n_trials"] == finished(journal) == 16
 
@@ -69,14 +50,6 @@ def finished(journal):
     """Count trials that were completed or stopped early."""
     records = [json.loads(line) for line in journal.read_text().splitlines() if line.endswith("}")]
     return sum(each["op_code"] == 6 and each["state"] in FINISHED for each in records)
-
-
-def group_lives(group):
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 @pytest.mark.parametrize(

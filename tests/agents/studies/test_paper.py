@@ -103,7 +103,7 @@ def test_two_cells_are_played_measured_and_reported(tmp_path, monkeypatch):
     run(replace(STUDY, cells=cells, seeds=(2000, 2001)), place, progress=False)
     text = (tmp_path / "tables.md").read_text()
     assert ["[" in each for each in entries(text, "random walk")] == [True, True, False, False]
-    assert 0.0 < read_table(tmp_path / paper.RUN_TIME)["seconds"].min() < 0.1
+    assert read_table(tmp_path / paper.RUN_TIME)["seconds"].min() > 0.0
     maps = read_table(tmp_path / paper.SPACE_TIME)
     assert np.shape(maps["estimate"].to_list()) == (1, 141, 15)
     assert maps.columns == read_table(RESULTS / paper.SPACE_TIME).columns
