@@ -1,11 +1,9 @@
 """The benchmarks run and pair the turns of a round; no test depends on speed."""
 
 import json
-import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,17 +12,13 @@ from agents.executors import ThisProcess
 from benchmarks import __main__ as benchmarks
 from benchmarks import long_roads
 from benchmarks.turns import Line, compare, take_turns
-from tests.helpers import SHORT
-
-ROOT = Path(__file__).parents[2]
+from tests.helpers import ROOT, SHORT
 
 
 def run(*words):
     """Run a benchmark in the root of the checkout; return what it prints."""
-    done = subprocess.run(
-        [sys.executable, "-m", *map(str, words), "--quick"], cwd=ROOT, capture_output=True,
-        text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False,
-    )  # fmt: skip
+    command = [sys.executable, "-m", *map(str, words), "--quick"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

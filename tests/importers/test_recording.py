@@ -2,14 +2,12 @@
 
 import dataclasses
 import re
-import subprocess
-import sys
 
 import numpy as np
 import polars as pl
 import pytest
 
-from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError
+from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError, recording
 from dptse_env.traffic import RecordLibrary
 from tests.importers.data import PLAIN, ROAD, first_file, plain, run, stream, write_csv
 
@@ -289,24 +287,20 @@ def test_units_that_may_be_several_are_asked_for(tmp_path):
     run(path, Source("table", columns, {"time": "frame"}, frame_rate=10.0))
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_memory_is_that_of_a_bucket_not_of_the_file(tmp_path):
-    # VmHWM is of this program alone; ru_maxrss begins with the memory of the one that started it.
-    code = (
-        "import re, sys; from pathlib import Path; from dptse_env.importers import recording;"
-        "from tests.importers.test_recording import ALL, run;"
-        "recording.BUCKET_ROWS = int(sys.argv[2]); run(Path(sys.argv[1]), splits=ALL);"
-        "status = Path('/proc/self/status').read_text();"
-        "print(int(re.search(r'VmHWM:\\s+(\\d+)', status)[1]) // 1024)"
-    )
-    vehicle, point = np.divmod(np.arange(2_000_000), 200)
-    columns = {"t": 2.0 * vehicle + 0.1 * point, "id": vehicle, "s": 2.0 * point + 0.1, "v": 20.0}
-    peaks = []
-    for rows in ("50_000", "100_000_000"):
-        path = subfolder(tmp_path, rows)
-        pl.DataFrame(columns).write_csv(path)
-        child = [sys.executable, "-c", code, str(path), rows]
-        peaks.append(int(subprocess.run(child, check=True, capture_output=True).stdout))
-    in_buckets, at_once = peaks  # [MB]; 350 and 940 were seen
-    assert in_buckets < 0.6 * at_once
+def test_what_is_in_memory_is_a_bucket_not_the_file(tmp_path, monkeypatch):
+    read, sizes, imported = pl.read_parquet, [], []
+
+    def watched(files):
+        table = read(files)
+        sizes.append(table.height)
+        return table
+
+    monkeypatch.setattr(pl, "read_parquet", watched)
+    points = stream()
+    for size in (2 * len(points), len(points) // 4):
+        monkeypatch.setattr(recording, "BUCKET_ROWS", size)
+        imported.append(run(plain(subfolder(tmp_path, str(size)), points)))
+    assert sizes[0] == sum(sizes[1:]) == len(points)
+    assert max(sizes[1:]) < len(points) / 2
+    at_once, in_buckets = (record_of(each).counts for each in imported)
+    np.testing.assert_array_equal(in_buckets, at_once)

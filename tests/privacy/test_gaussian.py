@@ -28,7 +28,7 @@ from dptse_env.privacy import (
     single_noise_std,
 )
 
-few = settings(deadline=None, max_examples=30)
+few = settings(max_examples=30)
 
 
 def close(expected, rel):
@@ -70,7 +70,6 @@ def test_golden_multipliers(epsilon, delta, kappa, analytic, digits):
     assert round(1.0 / mu_of(epsilon, delta), 3) == analytic
 
 
-@settings(deadline=None)
 @given(mu=logarithmic(1e-9, 1e3), deviations=st.floats(-20.0, 37.0))
 @example(mu=1e-9, deviations=0.0)
 @example(mu=9.9e-4, deviations=1e-3)  # on either side of where the formula changes
@@ -91,7 +90,6 @@ def test_epsilon_and_the_multiplier_match_dp_accounting(mu, epsilon, delta):
     assert 1.0 / mu_of(epsilon, delta) == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-11)
 
 
-@settings(deadline=None)
 @given(epsilon=logarithmic(1e-4, 1e4), delta=logarithmic(1e-12, 0.4999))
 @example(epsilon=5.0, delta=1e-12)
 @example(epsilon=20.0, delta=0.05)
@@ -118,7 +116,6 @@ def test_no_more_payments_are_allowed_than_the_reserve_covers():
         require_covered(int(too_many))
 
 
-@settings(deadline=None)
 @given(epsilon=epsilons, delta=deltas)
 @example(epsilon=1e-12, delta=0.49)
 @example(epsilon=1e-12, delta=1e-12)
@@ -130,7 +127,6 @@ def test_mu_is_the_largest_that_keeps_delta_and_le_ny_s_noise_is_more(epsilon, d
     assert delta_of(1.0 / kappa, epsilon) <= delta * (1.0 + 1e-9)
 
 
-@settings(deadline=None)
 @given(mu=mus, delta=deltas)
 def test_epsilon_is_the_smallest_that_keeps_delta(mu, delta):
     epsilon = epsilon_of(mu, delta)

@@ -2,12 +2,9 @@
 
 import contextlib
 import io
-from pathlib import Path
 from typing import NamedTuple
 
 from scripts import dptse
-
-ROOT = Path(__file__).parents[2]
 
 
 class Done(NamedTuple):

@@ -23,10 +23,10 @@ from dptse_env.traffic import RecordingError
 from dptse_env.utils.registry import EXTRAS
 from scripts import info
 from scripts.dptse import MODULES
-from tests.helpers import SHORT, fast_and_slow, save_untrained
+from tests.helpers import ROOT, SHORT, fast_and_slow, save_untrained
 from tests.importers.data import plain, stream
 from tests.importers.network.conftest import motorway
-from tests.scripts.commands import ROOT, refused, run_command
+from tests.scripts.commands import refused, run_command
 from tests.scripts.test_policy import save_model
 
 COMMANDS = [*MODULES, "import trajectories", "import network", "import field"]

@@ -11,11 +11,11 @@ import pytest
 
 from dptse_env.traffic import Demand, RecordLibrary, read_corridor
 from tests.agents.test_measured_field import source
-from tests.helpers import make_env
+from tests.helpers import ROOT, make_env
 from tests.importers.data import STRAIGHT, driven, plain, stream, write_csv
 from tests.importers.network.conftest import PATH, motorway
 from tests.importers.test_tables import FOOT, ngsim
-from tests.scripts.commands import ROOT, refused, run_command
+from tests.scripts.commands import refused, run_command
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
 ROAD = """n_mainline = 4

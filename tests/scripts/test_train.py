@@ -5,7 +5,6 @@ import re
 import shlex
 import signal
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -16,8 +15,6 @@ from agents.training.run_files import read_progress
 from tests.agents.training.plans import SMALL, STEPS, without_time
 from tests.helpers import SHORT, run_killed
 from tests.scripts.commands import refused, run_command
-
-ROOT = Path(__file__).parents[2]
 
 
 def words(output, algorithm="plackett-luce", *more):

@@ -6,8 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
 
@@ -20,6 +18,7 @@ from dptse_env.traffic import (
     simulate_in_worker,
 )
 from dptse_env.traffic.recording import record_seeds
+from tests.helpers import ROOT, wait_for
 from tests.traffic.test_record import assert_same
 
 UNGUARDED = """
@@ -45,13 +44,6 @@ class Code:
 
 
 DIES = Code("import os; os._exit(9)")
-
-
-def wait_for(condition, seconds=60.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.01)
 
 
 def record(folder, sources, workers=1):
@@ -109,13 +101,13 @@ def test_a_daemonic_process_records_and_stays_daemonic(tmp_path):
         target=in_daemon, args=(tmp_path,), daemon=True
     )
     process.start()
-    process.join(60)
+    process.join()
     assert (process.exitcode, process.daemon) == (0, True)
     assert (tmp_path / "0").is_file()
 
 
 def start_ensure(path, n_seeds, temporary):
-    environment = {"PYTHONPATH": str(Path.cwd()), "TMPDIR": str(temporary)}
+    environment = {"PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)}
     return subprocess.Popen(
         [sys.executable, "-c", ENSURE, str(path), str(n_seeds)],
         stdout=subprocess.PIPE,
@@ -126,32 +118,18 @@ def start_ensure(path, n_seeds, temporary):
     )
 
 
-def workers_of(pid):
-    """Return the processes that run in the session of a process, other than itself."""
-    rows = ps("-A", "-o", "pid=,sess=,stat=").split("\n")
-    rows = [row.split() for row in rows if row]
-    running = [int(row[0]) for row in rows if row[1] == str(pid) and row[2][0] != "Z"]
-    return [each for each in running if each != pid]
-
-
-def ps(*options):
-    return subprocess.run(["ps", *options], capture_output=True, text=True, check=False).stdout
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="finds workers by the columns of Linux's ps")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows kills otherwise")
 @pytest.mark.parametrize(("send", "how"), [("kill", "KILL"), ("kill", "INT"), ("killpg", "INT")])
 def test_a_killed_parent_leaves_no_orphans_no_files_and_a_valid_library(send, how, tmp_path):
     how, temporary = signal.Signals[f"SIG{how}"], tmp_path / "temporary"
     temporary.mkdir()
     process = start_ensure(tmp_path / "library", 400, temporary)
     wait_for(lambda: len(list((tmp_path / "library").rglob("*.safetensors"))) >= 4)
-    workers = workers_of(process.pid)
-    assert len(workers) >= 2
     getattr(os, send)(process.pid, how)  # to the parent, or as a terminal does
-    _, said = process.communicate(timeout=60)
-    wait_for(lambda: not any(ps("-p", str(pid), "-o", "pid=") for pid in workers), seconds=20)
-    wait_for(lambda: list(temporary.iterdir()) == [], seconds=20)
+    # Workers have its pipes as well: both end with the last of them.
+    _, said = process.communicate(timeout=600)
+    assert list(temporary.iterdir()) == []
     records = RecordLibrary(tmp_path / "library")
     made = set(range(400)) - set(records.missing(SHORT_HIGHWAY, range(400)))
     assert 0 < len(made) < 400
@@ -166,7 +144,7 @@ def test_a_killed_parent_leaves_no_orphans_no_files_and_a_valid_library(send, ho
 def test_processes_recording_the_same_seeds_agree(tmp_path, short_record):
     processes = [start_ensure(tmp_path / "library", 3, tmp_path) for _ in range(2)]
     for process in processes:
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate()
         assert process.returncode == 0, errors
     assert_same(RecordLibrary(tmp_path / "library").get(SHORT_HIGHWAY, 0), short_record)
     assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 3
@@ -201,7 +179,7 @@ def test_a_script_without_a_main_guard_and_one_from_a_pipe_work(tmp_path, short_
         result = subprocess.run(
             [sys.executable, *arguments],
             input=text,
-            env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
             capture_output=True,
             text=True,
             check=False,
