@@ -2,6 +2,7 @@
 
 import gc
 import os
+import pkgutil
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -38,3 +39,12 @@ def record_cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("records")
     os.environ["DPTSE_CACHE"] = str(folder)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def registries(monkeypatch):
+    """Forget at the end of a test which parts it has registered."""
+    from dptse_env.registration import REGISTRIES
+
+    for registry in map(pkgutil.resolve_name, REGISTRIES.values()):
+        monkeypatch.setattr(registry, "_parts", dict(registry._parts))

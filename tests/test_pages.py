@@ -59,7 +59,9 @@ def test_the_site_is_refused_with_dead_links_and_with_files_of_other_hosts(tmp_p
         '<h1 id="ε">A</h1> <a href="#%CE%B5">a</a> <a href="#no">b</a> <img src="no.png">'
         '<a href="https://far.example">c</a> <script src="https://far.example/c.js"></script>'
     )
-    (tmp_path / "404.html").write_text('<a href="/page.html#ε">d</a> <a href="/no.html">e</a>')
+    (tmp_path / "404.html").write_text(
+        '<a href="/page.html#ε">d</a> <a href="/no.html">e</a>', "utf-8"
+    )
     (tmp_path / "a.css").write_text("a {b: url(https://far.example/d.woff)} c {d: url(e.png)}")
     problems = runpy.run_path(str(ROOT / "docs" / "_site" / "links.py"))["problems"]
     assert sorted(problems(tmp_path)) == [

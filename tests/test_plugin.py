@@ -4,7 +4,6 @@ import json
 import pickle
 import sys
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,7 +12,6 @@ import pytest
 
 from dptse_env import register_part
 from dptse_env.estimators import Estimate
-from dptse_env.registration import REGISTRIES
 from dptse_env.schedules import make_schedule
 from tests.helpers import SHORT, assert_same, lock_step, play
 
@@ -24,15 +22,6 @@ import dptse_plugin  # noqa: E402
 from dptse_plugin import parts  # noqa: E402
 
 KEYWORDS = [keyword for keyword in dptse_plugin.PARTS if keyword != "schedule"]
-
-
-@pytest.fixture(autouse=True)
-def registries(monkeypatch):
-    """Forget at the end of a test what it has registered."""
-    for path in REGISTRIES.values():
-        module, _, attribute = path.partition(":")
-        registry = getattr(import_module(module), attribute)
-        monkeypatch.setattr(registry, "_parts", dict(registry._parts))
 
 
 def by_module(keyword):

@@ -100,7 +100,9 @@ def is_said(_):
 
 def test_processes_have_one_thread_and_do_not_repeat_what_this_one_has_said(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    compiling_is_said.set()
+    said = threading.Event()
+    said.set()
+    monkeypatch.setattr("agents.executors.compiling_is_said", said)
     executor = LocalProcesses(2)
     assert run(executor, n_warnings, ["dptse_env.config", "torch"]) == [0, 1]
     assert run(executor, is_said, [1]) == [True]

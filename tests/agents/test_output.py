@@ -132,7 +132,7 @@ def test_the_page_has_what_happened_and_needs_no_network(episode, tmp_path, monk
     errors = [("paper", {"rmse_density": (10.5, 1.0), "rmse_speed": (5.0, 0.5)})]
     path = tmp_path / "page.html"
     write_page(path, "A title with <script>", errors, [episode], 0)
-    text = path.read_text()
+    text = path.read_text("utf-8")
     assert '"label":"80"' in text
     assert "src=" not in text.replace("src=null", "").split("<body>")[0]
     assert text.count("<script src") == 0

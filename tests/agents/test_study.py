@@ -52,7 +52,7 @@ def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
         (1, 2000), (1, 2001), (2, 2000), (2, 2001),
     ]  # fmt: skip
     assert rows["reward"].to_list() == [row["reward"] for row in expected]
-    tables = (tmp_path / "tables.md").read_text()
+    tables = (tmp_path / "tables.md").read_text("utf-8")
     assert f"| 1 | {rows['rmse_density'][:2].mean():.6f} |" in tables
     assert "| 9 | - |" in tables
     assert not (tmp_path / "rows").exists()
@@ -61,8 +61,8 @@ def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
     write_table(tmp_path / "rows.parquet", old)
     run(replace(first, cells=(*first.cells, cell(3))), place, progress=False)
     assert sorted(rows_of(tmp_path)["version"].to_list())[:4] == ["0.1.0"] * 4
-    assert "| 1 | 7.000000 |" in (tmp_path / "tables.md").read_text()
-    assert "0.1.0 (4 episodes)" in (tmp_path / "tables.md").read_text()
+    assert "| 1 | 7.000000 |" in (tmp_path / "tables.md").read_text("utf-8")
+    assert "0.1.0 (4 episodes)" in (tmp_path / "tables.md").read_text("utf-8")
     assert calls == [tmp_path]
 
 

@@ -186,7 +186,7 @@ def test_vehicles_that_share_an_id_at_one_time_are_told_apart(shuffled, tmp_path
     np.testing.assert_allclose(record.speed_sums, expected.speed_sums)
     for vehicle in np.unique(record.vehicle):
         assert (np.diff(record.segment[record.vehicle == vehicle][:-1]) >= 0).all()
-    text = (tmp_path / "shared" / "imported" / "report.md").read_text()
+    text = (tmp_path / "shared" / "imported" / "report.md").read_text("utf-8")
     assert "| 4 | ids of several vehicles at one time, told apart by their positions |" in text
 
 
@@ -214,7 +214,7 @@ def test_rows_off_the_road_are_dropped_and_counted(tmp_path):
     assert file["off_lanes"] == (points[:, 0] == 3).sum()
     assert file["off_ends"] == (points[:, 0] == 5).sum()
     assert file["off_the_road"] == ["9"]
-    text = (tmp_path / "imported" / "report.md").read_text()
+    text = (tmp_path / "imported" / "report.md").read_text("utf-8")
     assert f"| {file['off_ends']} | dropped: before the road's start or beyond its end |" in text
     assert "veh/h on the mainline, no on-ramps, no exits, average dwell" in text
 
@@ -264,7 +264,7 @@ def test_units_that_nobody_gave_are_recognised(factors, recognised, tmp_path):
     write_csv(path, {"t": time, "id": vehicle.astype(int), "s": x, "v": speed})
     imported = run(path)
     assert first_file(imported)["recognised"] == recognised
-    text = (tmp_path / "changed" / "imported" / "report.md").read_text()
+    text = (tmp_path / "changed" / "imported" / "report.md").read_text("utf-8")
     assert (f"Recognised, since nobody gave it: {recognised}." in text) == bool(recognised)
     record = record_of(imported, 1)
     np.testing.assert_array_equal(record.counts, expected.counts)

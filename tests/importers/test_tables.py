@@ -164,7 +164,7 @@ LISTS = ("timestamp", "x_position", "y_position")
 
 def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expected):
     path = tmp_path / "i24.json"
-    path.write_text("\ufeff" + json.dumps(i24(stream()) + i24(stream(), -1, 500)))
+    path.write_text("\ufeff" + json.dumps(i24(stream()) + i24(stream(), -1, 500)), "utf-8")
     with pytest.raises(TrajectoryError, match=r"\d+ % of the vehicles"):
         run(path, Source("i24", layout=Layout(origin=310000.0)))
     east = Source("i24", where={"direction": 1}, layout=Layout(origin=310000.0))
@@ -205,7 +205,7 @@ def test_tables_may_be_parquet_compressed_or_by_other_delimiters(tmp_path, expec
     text = path.read_text()
     (tmp_path / "a.csv.gz").write_bytes(gzip.compress(text.encode()))
     (tmp_path / "semicolons.csv").write_text(text.replace(",", ";").replace("\n", "\n\n", 3))
-    (tmp_path / "tabs.txt").write_text("\ufeff" + text.replace(",", "\t"))
+    (tmp_path / "tabs.txt").write_text("\ufeff" + text.replace(",", "\t"), "utf-8")
     vehicle, time, x, speed = stream().T
     table = pl.DataFrame({"t": time.round(4), "id": vehicle, "s": x.round(4), "v": speed})
     table.write_parquet(tmp_path / "a.parquet")

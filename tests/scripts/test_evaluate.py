@@ -35,7 +35,7 @@ def test_tables_rows_figures_and_json_agree(tmp_path):
     assert set(rows.select("estimator", "policy", "traffic_seed").iter_rows()) == {
         ("random_walk", name, seed) for name in ("none", "round-robin") for seed in (2000, 2001)
     }
-    tables = (tmp_path / "out" / "tables.md").read_text()
+    tables = (tmp_path / "out" / "tables.md").read_text("utf-8")
     found = json.loads(run_command("evaluate", *words, "--force", "--json").stdout)
     means = {}
     for row in found["rows"]:
@@ -77,7 +77,7 @@ def test_one_episode_has_no_interval(tmp_path):
     assert error == {"mean": pytest.approx(-1000.0 * reward), "low": None, "high": None, "n": 1}
     other = rows_of(tmp_path, "round-robin")["reward"][0]
     assert row["differences"]["error"]["mean"] == pytest.approx(1000.0 * (other - reward))
-    tables = (tmp_path / "tables.md").read_text()
+    tables = (tmp_path / "tables.md").read_text("utf-8")
     assert "one episode has no interval" in tables.lower()
     assert "±" not in tables
     assert "1 episode on test traffic" in tables

@@ -90,10 +90,10 @@ def test_a_study_of_ones_own_runs_from_the_command_line(tmp_path):
     assert done.returncode == 0, done.stderr
     rows = read_rows("my-study", tmp_path / "out")
     assert len(rows) == len(STUDY.cells) * len(STUDY.seeds)
-    tables = (tmp_path / "out" / "tables.md").read_text()
+    tables = (tmp_path / "out" / "tables.md").read_text("utf-8")
     own = rows.filter(pl.col("rule") == "round-robin", pl.col("bandwidth") == 2)
     row = next(line for line in tables.splitlines() if line.startswith("| round-robin"))
     assert re.findall(r"[\d.]+ \[", row)[1] == f"{own['rmse_density'].mean():.2f} ["
     (tmp_path / "out" / "tables.md").unlink()
     assert run_command("study", *words, "--report").returncode == 0
-    assert (tmp_path / "out" / "tables.md").read_text() == tables
+    assert (tmp_path / "out" / "tables.md").read_text("utf-8") == tables

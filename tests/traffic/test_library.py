@@ -5,7 +5,6 @@ import logging
 import os
 import pickle
 import re
-import time
 
 import numpy as np
 import pytest
@@ -155,17 +154,17 @@ def test_bad_seeds_and_counts_are_refused(tmp_path):
     assert everything_in(tmp_path) == []
 
 
-def test_what_a_dead_writer_left_is_removed_when_it_is_old(tmp_path):
+def test_what_a_dead_writer_left_is_removed_when_it_is_old(tmp_path, monkeypatch):
+    now = 1e9
+    monkeypatch.setattr("time.time", lambda: now)
     tiny_record(tmp_path, 0)
     records = RecordLibrary(tmp_path)
     folder = records.record_path(SHORT_HIGHWAY, 0).parent
     names = [".00000007-1111", ".00000008-2222"]
-    for name, age in zip(names, (library.LEFTOVER_AGE + 60, 60), strict=True):
+    for name, age in zip(names, (library.LEFTOVER_AGE + 1, library.LEFTOVER_AGE), strict=True):
         (folder / name).write_bytes(b"half")
-        then = time.time() - age
-        os.utime(folder / name, (then, then))
-    then = time.time() - 2 * library.LEFTOVER_AGE
-    os.utime(records.record_path(SHORT_HIGHWAY, 0), (then, then))
+        os.utime(folder / name, (now - age, now - age))
+    os.utime(records.record_path(SHORT_HIGHWAY, 0), (0, 0))
     records.ensure(SHORT_HIGHWAY, [0])
     assert (folder / names[0]).exists()  # nothing is written, so nothing is swept
     records.ensure(SHORT_HIGHWAY, [1])

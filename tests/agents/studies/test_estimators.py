@@ -115,4 +115,4 @@ def test_it_plays_and_reports(tmp_path):
     errors = (squares / n).sqrt().to_list()
     assert errors == pytest.approx(rows["rmse_speed"].to_list(), rel=1e-4)
     error = -1000.0 * rows.filter(estimator="ekf")["reward"].mean()
-    assert f"| ShortHighway-v0 | {error:.1f} [" in (tmp_path / "tables.md").read_text()
+    assert f"| ShortHighway-v0 | {error:.1f} [" in (tmp_path / "tables.md").read_text("utf-8")

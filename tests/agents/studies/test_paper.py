@@ -101,7 +101,7 @@ def test_two_cells_are_played_measured_and_reported(tmp_path, monkeypatch):
     cells = tuple(cell for cell in CELLS if cell.labels in base)
     place = Place(tmp_path, THIS_PROCESS)
     run(replace(STUDY, cells=cells, seeds=(2000, 2001)), place, progress=False)
-    text = (tmp_path / "tables.md").read_text()
+    text = (tmp_path / "tables.md").read_text("utf-8")
     assert ["[" in each for each in entries(text, "random walk")] == [True, True, False, False]
     assert read_table(tmp_path / paper.RUN_TIME)["seconds"].min() > 0.0
     maps = read_table(tmp_path / paper.SPACE_TIME)

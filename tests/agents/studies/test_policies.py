@@ -101,7 +101,7 @@ def entry(interval):
 
 def test_the_report_compares_with_the_rule_that_validation_chose(ladder, errors):
     write_report(policies.STUDY, ladder)
-    text = (ladder / "tables.md").read_text()
+    text = (ladder / "tables.md").read_text("utf-8")
     own = errors["ppo-road"]
     typical = np.sort(own.mean(axis=1))[1:4].mean()
     found = line(text, "ppo-road")
@@ -124,7 +124,7 @@ def test_what_was_not_played_yet_is_a_dash(ladder):
     write_table(ladder / "rows.parquet", rows)
     (ladder / policies.CURVES).unlink()
     write_report(policies.STUDY, ladder)
-    text = (ladder / "tables.md").read_text()
+    text = (ladder / "tables.md").read_text("utf-8")
     assert line(text, BEST)[2:] == ["0.0 [0.0, 0.0]", "-", "-", "-"]
     assert line(text, "short")[4:] == ["-"] * 5
     assert "| ppo-road |" not in text  # nothing says that these rows are those of its trainings
@@ -156,7 +156,7 @@ def test_recorded_gains_are_those_of_their_rows(tmp_path):
         return -1000.0 * own["reward"].to_numpy().reshape(-1, 32)
 
     gain = bootstrap(percent_below, errors("learned"), errors(ROUND_ROBIN))
-    found = line((tmp_path / "tables.md").read_text(), "2")
+    found = line((tmp_path / "tables.md").read_text("utf-8"), "2")
     assert found[3:] == ["-", entry(gain)]
 
 
@@ -186,7 +186,7 @@ def test_rows_of_a_policy_that_was_shipped_before_are_left_out(ladder, errors):
         rows = pl.concat([rows, pl.DataFrame(table)], how="diagonal_relaxed")
     write_table(ladder / "rows.parquet", rows)
     write_report(policies.STUDY, ladder)
-    assert line((ladder / "tables.md").read_text(), "short-highway")[2].startswith("10.0 [")
+    assert line((ladder / "tables.md").read_text("utf-8"), "short-highway")[2].startswith("10.0 [")
 
 
 def test_every_learner_has_a_plan_in_the_settings_that_it_fits():
@@ -250,6 +250,6 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     rows = read_rows("policies", tmp_path).filter(part=TEST)
     assert rows["cell"].n_unique() == 2 + 2 + 6
     assert rows.filter(policy=GAIN)["traffic_seed"].n_unique() == 2
-    assert "| plackett-luce |" in (tmp_path / "tables.md").read_text()
+    assert "| plackett-luce |" in (tmp_path / "tables.md").read_text("utf-8")
     with pytest.raises(ValueError, match=r"another plan: minutes is 0\.05 there and 0\.1 now"):
         train_ladder(study, place, 0.1, (0,))
