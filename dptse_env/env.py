@@ -90,13 +90,14 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     **End of an episode**: truncated after ``horizon`` seconds, by default with the record; never
     terminated.
 
-    **Info**: the same keys at the reset and at every step; numbers are floats.
+    **Info**: the same keys at the reset and at every step; numbers are floats, but for the seed.
 
     | key                 | value                                                                  |
     | :--                 | :--                                                                    |
     | ``rmse_density``    | error of the estimated mainline densities [veh/km]; true traffic       |
     | ``rmse_speed``      | error of the speeds of occupied segments [km/h]; true traffic          |
     | ``n_occupied``      | mainline segments with a vehicle; true traffic                         |
+    | ``traffic_seed``    | seed of the record that is replayed, an integer; true traffic          |
     | ``n_dropped``       | requested options that were cut, repeated or replaced                  |
     | ``queried``         | the options that were queried, flags of shape (G,)                     |
     | ``diverged``        | 1 if the estimator diverged in this second and was started anew        |

@@ -23,8 +23,8 @@ from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.threads import EpisodeThreads
 from dptse_env.utils.vector_info import Rows, row_of
 
-TRUTH_INFO = ("rmse_density", "rmse_speed", "n_occupied", "truth")
-"""Keys of ``info`` that come from the true traffic; the others are public."""
+TRUTH_INFO = ("rmse_density", "rmse_speed", "n_occupied", "traffic_seed", "truth")
+"""Keys of ``info`` that come from the true traffic, or name its record; the others are public."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,7 @@ class QueryProcess:
         self._checks_releases = is_foreign(self.release)
         self._checks_decisions = is_foreign(self.interface.actions)
         self.n_episodes = n = parts.n_episodes
+        self._seeds = np.array(self.config.traffic_seeds)
         queries = self.interface.queries
         self.pending = PendingPicks(n, queries.n_options)
         self.traffic_index = np.zeros(n, dtype=np.int64)
@@ -320,14 +321,16 @@ class QueryProcess:
     def infos(self, episodes: IntArray) -> Rows:
         """Return the infos of ``episodes``, shape (k,): fresh arrays of k rows each.
 
-        The keys in `TRUTH_INFO` come from the true traffic. They serve training and evaluation, as
-        the reward does, and are not covered by the guarantee. The others are public.
+        The keys in `TRUTH_INFO` come from the true traffic, or name its record. They serve training
+        and evaluation, as the reward does, and are not covered by the guarantee. The others are
+        public.
         """
         mu, epsilon = self.release.spent(episodes, self.elapsed[episodes])
         infos: Rows = {
             "rmse_density": self.error.density[episodes],
             "rmse_speed": self.error.speed[episodes],
             "n_occupied": self.error.n_occupied[episodes].astype(np.float64),
+            "traffic_seed": self._seeds[self.traffic_index[episodes]],
             "n_dropped": self.n_dropped[episodes].astype(np.float64),
             "diverged": self.estimator.diverged[episodes].astype(np.float64),
             "fallback": self.estimator.fallback[episodes].astype(np.float64),
@@ -345,7 +348,6 @@ class QueryProcess:
         return {
             "density": truth[:, :, 0].copy(),
             "speed": truth[:, :, 1].copy(),
-            "traffic_seed": np.array(self.config.traffic_seeds)[traffic],
             "time": self.time[episodes],
             **self.release.private(episodes, traffic),
         }

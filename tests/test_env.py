@@ -91,6 +91,7 @@ def test_info_has_the_same_finite_numbers_at_every_step():
     for info in [at_reset, *(step[4] for step in steps)]:
         numbers = {**info}
         flags = numbers.pop("queried")
+        assert type(numbers.pop("traffic_seed")) is int
         assert (flags.dtype, flags.sum() <= 2) == (bool, True)
         assert info.keys() == at_reset.keys()
         assert all(type(value) is float and np.isfinite(value) for value in numbers.values())
@@ -99,20 +100,21 @@ def test_info_has_the_same_finite_numbers_at_every_step():
 def test_truth_is_shown_only_on_request():
     assert "truth" not in make_env().reset(seed=0)[1]
     info = make_env(truth_in_info=True).reset(seed=0)[1]
-    assert set(info["truth"]) == {"density", "speed", "traffic_seed", "time"}
+    assert set(info["truth"]) == {"density", "speed", "time"}
     assert set(TRUTH_INFO) <= set(info)
 
 
 def test_reset_options_choose_the_traffic_and_the_start_and_leave_the_rest():
     env = make_env(horizon=50, random_start=True, truth_in_info=True)
-    truth = env.reset(seed=0, options={"traffic_seed": 2, "start": 100})[1]["truth"]
-    assert (truth["traffic_seed"], truth["time"]) == (2, 100)
+    info = env.reset(seed=0, options={"traffic_seed": 2, "start": 100})[1]
+    assert (info["traffic_seed"], info["truth"]["time"]) == (2, 100)
+    assert env.step(env.action_space.sample())[4]["traffic_seed"] == 2
     starts = {env.reset()[1]["truth"]["time"] for _ in range(30)}
     assert len(starts) > 10
     assert max(starts) <= 190
     free = play(env, 10, seed=9)
     env.action_space.seed(9)  # and with the traffic chosen, start and noise are as they were
-    chosen = {"traffic_seed": int(free[0][1]["truth"]["traffic_seed"])}
+    chosen = {"traffic_seed": free[0][1]["traffic_seed"]}
     fixed = [env.reset(seed=9, options=chosen)]
     assert_same(free, fixed + [env.step(env.action_space.sample()) for _ in range(10)])
 

@@ -59,9 +59,8 @@ def test_seeds_and_options_hold_for_one_reset():
     env.set_options([{"start": 7}, {"start": 9, "traffic_seed": 1}, {"start": 7}])
     env.reset()
     first = env.step(ACTIONS)[1]
-    truths = [info["truth"] for info in env.reset_infos]
-    assert [truth["time"] for truth in truths] == [7, 9, 7]
-    assert truths[1]["traffic_seed"] == 1
+    assert [info["truth"]["time"] for info in env.reset_infos] == [7, 9, 7]
+    assert env.reset_infos[1]["traffic_seed"] == 1
     starts = set()
     for _ in range(6):
         env.reset()
@@ -179,8 +178,7 @@ def test_replicas_meet_the_same_traffic_and_noise_after_resets_too(seed, keyword
             assert dones.all() or rewards[0] == 0.0 or rewards[0] != rewards[3]
         groups = groups_of(env, observation)
         assert (groups == groups[:, :1]).all()
-        truths = [info["truth"] for info in env.reset_infos]
-        places = [(truth["traffic_seed"], truth["time"]) for truth in truths]
+        places = [(info["traffic_seed"], info["truth"]["time"]) for info in env.reset_infos]
         assert places[:3] == places[:1] * 3
         assert places[3:] == places[3:4] * 3
         starts |= {places[0], places[3]}
