@@ -1,15 +1,19 @@
 """Studies: cells played on traffic seeds, their rows on disk, and a report made of the rows alone.
 
 The rows of a study stand in ``rows.parquet`` of its folder: a line for each episode, with the
-study, the version of the package that played it, the cell's id and its labels. While a study runs,
-each finished cell has a file of its own under ``rows/``; they are packed when all are there, and
-taken up again after an interruption.
+study, the version of the code that played it (`dptse_env.versions`), the cell's id and its labels.
+A cell counts as played where the numbers of that version are those of this one; rows that are
+played again stand below the ones before.
+
+While a study runs, each finished cell has a file of its own under ``rows/``; they are packed when
+all are there, and taken up again after an interruption.
 """
 
 from __future__ import annotations
 
 import hashlib
 import shutil
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,11 +22,12 @@ from typing import NamedTuple
 
 import polars as pl
 
-import dptse_env
 from agents.executors import AnyExecutor, ThisProcess, run_shown
 from agents.play import Cell, corridor_of, play, record
+from agents.tables import are_present, numbers
 from dptse_env.traffic import Records
 from dptse_env.utils.files import replacing, write_atomically
+from dptse_env.versions import code_version, numbers_of
 
 ROWS, TABLES = "rows.parquet", "tables.md"
 """Files of a study's folder, beside its figures."""
@@ -124,20 +129,31 @@ def write_report(study: Study, folder: Path) -> None:
 
 def _footer(rows: pl.DataFrame) -> str:
     """Return where the rows of a report come from."""
-    counts = rows.group_by("version").len().sort("version")
-    versions = ", ".join(f"{version} ({n:,} episodes)" for version, n in counts.iter_rows())
-    return f"Played by dptse-env {versions}. Differences are paired within one version."
+    equal: dict[str, list[str]] = {}
+    for version, n in rows.group_by("version").len().sort("version").iter_rows():
+        equal.setdefault(numbers_of(version), []).append(f"{version} ({n:,} episodes)")
+    versions = ", ".join(map(" = ".join, equal.values()))
+    return f"Played by dptse-env {versions}. Differences are paired within equal numbers."
 
 
 def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: bool) -> None:
-    """Play the cells that the rows lack, and pack all rows into one file."""
+    """Play the cells that rows of these numbers lack, and pack all rows into one file."""
     rows = read_rows(study.name, place.folder)
-    played = dict(rows.group_by("cell").agg("traffic_seed").iter_rows())
+    present = are_present(rows)
+    played = dict(rows.filter(present).group_by("cell").agg("traffic_seed").iter_rows())
     missing = [
         (cell, study.seeds_of(cell))
         for cell_id, cell in {cell.id: cell for cell in cells}.items()
         if not set(study.seeds_of(cell)) <= set(played.get(cell_id, ()))
     ]
+    others = rows.filter(~present, pl.col("cell").is_in([cell.id for cell, _ in missing]))
+    if not others.is_empty():
+        warnings.warn(
+            f"{others['cell'].n_unique()} cells of the study {study.name!r} are played again: "
+            f"their rows are by dptse-env {', '.join(others['version'].unique().sort())}, whose "
+            f"numbers are not declared equal to those of {code_version()}",
+            stacklevel=2,
+        )
     for cell, _ in missing:
         cell.check()
     for corridor, seeds in dict.fromkeys((corridor_of(cell), seeds) for cell, seeds in missing):
@@ -158,8 +174,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
         mininterval=0.5,
     )
     if folder.is_dir():
-        rows = read_rows(study.name, place.folder)
-        write_table(place.folder / ROWS, rows.sort("cell", "version", "traffic_seed"))
+        write_table(place.folder / ROWS, read_rows(study.name, place.folder))
         shutil.rmtree(folder)
 
 
@@ -176,7 +191,7 @@ def _play_cell(
     clash = sorted(cell.labels.keys() & {*ORIGIN, *rows[0]})
     if clash:
         raise ValueError(f"labels must differ from the names of columns, got {clash[0]!r}")
-    head = dict(zip(ORIGIN, (study, dptse_env.__version__, cell.id), strict=True))
+    head = dict(zip(ORIGIN, (study, code_version(), cell.id), strict=True))
     rows = [{**head, **cell.labels, **row} for row in rows]
     return pl.DataFrame(rows, infer_schema_length=None)
 
@@ -187,6 +202,8 @@ def _file_of(folder: Path, cell_id: str) -> Path:
 
 def read_rows(study: str, folder: Path) -> pl.DataFrame:
     """Return all rows in the folder of a study, those of an interrupted run too.
+
+    Of rows of a cell and a traffic seed by versions of equal numbers it is the last one.
 
     Raises:
         ValueError: A file is damaged, or of another study.
@@ -203,9 +220,10 @@ def read_rows(study: str, folder: Path) -> pl.DataFrame:
                     "--output"
                 )
     if not tables:
-        return pl.DataFrame(schema=keys)
+        return pl.DataFrame(schema={**dict.fromkeys(ORIGIN, pl.String), "traffic_seed": pl.Int64})
     rows: pl.DataFrame = pl.concat(tables, how="diagonal_relaxed")
-    return rows.unique(keys, keep="last", maintain_order=True)
+    kept = rows.select(*keys).with_columns(version=numbers(rows)).with_row_index("row")
+    return rows[kept.unique(keys, keep="last", maintain_order=True)["row"]]
 
 
 def read_table(path: Path, columns: Sequence[str] = ()) -> pl.DataFrame:

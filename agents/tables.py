@@ -10,6 +10,7 @@ import polars as pl
 
 from agents.statistics import Interval, mean_interval
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.versions import code_version, numbers_of
 
 DENSITY, SPEED, ERROR = "rmse_density", "rmse_speed", "error"
 METRICS = {DENSITY: ("density", "veh/km"), SPEED: ("speed", "km/h")}
@@ -31,10 +32,21 @@ class UnmeasuredError(LookupError):
     """The rows that a number needs are not there."""
 
 
+def numbers(rows: pl.DataFrame) -> pl.Series:
+    """Return the name of the numbers of each row, see `dptse_env.versions.numbers_of`."""
+    versions = rows["version"]
+    return versions.replace({each: numbers_of(each) for each in versions.unique()})
+
+
+def are_present(rows: pl.DataFrame) -> pl.Series:
+    """Return which rows have the numbers of this code."""
+    return numbers(rows) == numbers_of(code_version())
+
+
 def pick(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
     """Return the rows of a cell by its labels, in the order of traffic seeds.
 
-    Where it was played by several versions, it is the rows of the last one.
+    Where it was played with several numbers, it is the rows of the last ones.
 
     Raises:
         UnmeasuredError: There are none.
@@ -43,26 +55,28 @@ def pick(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
     found = _with_labels(rows, labels)
     if found.is_empty():
         raise UnmeasuredError(dict(labels))
-    return _one_cell(found.filter(pl.col("version") == _last(found)), labels)
+    return _one_cell(found.filter(pl.col("version") == found["version"][-1]), labels)
 
 
 def pick_paired(rows: pl.DataFrame, *cells: Labels) -> list[pl.DataFrame]:
-    """Return the rows of cells on the traffic seeds that they share, played by one version.
+    """Return the rows of cells on the traffic seeds that they share, of equal numbers.
 
-    It is the last version that played all of them.
+    It is the last numbers with which all of them were played.
 
     Raises:
-        UnmeasuredError: None has played all of them on two traffic seeds.
+        UnmeasuredError: With none were all of them played on two traffic seeds.
         ValueError: Labels are those of several cells.
     """
     found = [_with_labels(rows, each) for each in cells]
-    shared = found[0].select(*_PAIRED).unique()
+    shared = found[0].select(*_PAIRED).unique(maintain_order=True)
     for each in found[1:]:
-        shared = shared.join(each, on=_PAIRED, how="semi")
+        shared = shared.join(each, on=_PAIRED, how="semi", maintain_order="left")
     if not shared.is_empty():
-        shared = shared.filter(pl.col("version") == _last(shared))
+        shared = shared.filter(pl.col("version") == shared["version"][-1])
     if len(shared) < 2:
-        raise UnmeasuredError(*map(dict, cells))
+        raise UnmeasuredError(
+            "cells were not played on two traffic seeds by versions of equal numbers", *cells
+        )
     return [
         _one_cell(each.join(shared, on=_PAIRED, how="semi"), labels)
         for each, labels in zip(found, cells, strict=True)
@@ -73,15 +87,14 @@ _PAIRED = ("version", "traffic_seed")
 
 
 def _with_labels(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
-    """Return the rows that have some labels, of which a part that was not played has no column."""
+    """Return the rows that have some labels, with the name of their numbers for the version.
+
+    A part that was not played has no column.
+    """
     if not labels.keys() <= set(rows.columns):
         return rows.clear()
-    return rows.filter(*(pl.col(name) == value for name, value in labels.items()))
-
-
-def _last(rows: pl.DataFrame) -> str:
-    versions: list[str] = rows["version"].unique().to_list()
-    return max(versions, key=lambda text: [int(part) for part in text.split(".")[:3]])
+    found = rows.filter(*(pl.col(name) == value for name, value in labels.items()))
+    return found.with_columns(version=numbers(found))
 
 
 def _one_cell(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:

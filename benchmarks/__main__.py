@@ -12,7 +12,6 @@ import platform
 import traceback
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal, get_args
@@ -21,10 +20,11 @@ from agents.tables import markdown
 from benchmarks.turns import HEADER, Line, as_cells, measure, show
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.threads import n_cores
+from dptse_env.versions import versions_with
 from scripts.cli import run
 
 Part = Literal["estimators", "environment", "learning", "long_roads"]
-PACKAGES = ("dptse-env", "libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
+PACKAGES = ("libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def main(args: Args) -> None:
     Raises:
         SystemExit: A part failed; the others were measured.
     """
-    versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
+    versions = ", ".join(map(" ".join, versions_with(*PACKAGES).items()))
     title = f"Python {platform.python_version()}, {n_cores()} cores; {versions}"
     if args.output is not None:
         args.output.parent.mkdir(parents=True, exist_ok=True)

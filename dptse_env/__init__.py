@@ -15,12 +15,12 @@ query policy::
 from typing import TYPE_CHECKING, Any
 
 from dptse_env.registration import register_environments, register_part
+from dptse_env.versions import __version__
 
 if TYPE_CHECKING:
     from dptse_env.evaluation import evaluate
 
-__all__ = ["evaluate", "register_environments", "register_part"]
-__version__ = "0.2.0"
+__all__ = ["__version__", "evaluate", "register_environments", "register_part"]
 
 register_environments()
 

@@ -16,7 +16,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +45,7 @@ from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import RecordLibrary, ranges
 from dptse_env.utils.fields import integer, require
 from dptse_env.utils.files import replacing, write_atomically
+from dptse_env.versions import code_version
 from scripts.cli import Machines
 
 PAGE, STAGES, SEARCH = "page.html", "stages", "search.json"
@@ -214,7 +214,7 @@ def keep(path: Path, fit: Fit, road: Road) -> None:
         "error": fit.error,
         "at_bounds": fit.at_bounds,
         "date": date.today().isoformat(),
-        "version": version("dptse-env"),
+        "version": code_version(),
     }
     with replacing(path) as temporary:
         write_parameters(temporary, fit.parameters, provenance)

@@ -5,7 +5,6 @@ dptse info
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import json
 import os
@@ -22,6 +21,7 @@ from dptse_env.traffic import RecordLibrary
 from dptse_env.traffic.library import CACHE_VARIABLE
 from dptse_env.utils.kernels import default_folder
 from dptse_env.utils.threads import n_cores
+from dptse_env.versions import code_version
 
 PACKAGES = (
     "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "mpmath",
@@ -44,20 +44,11 @@ class Args:
     """Print JSON, for a program."""
 
 
-def _code_digest() -> str:
-    """Return 12 digits of a digest of the code, which changes more often than the version."""
-    digest, root = hashlib.sha256(), Path(dptse_env.__file__).parent
-    for path in sorted(root.rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
 def collect() -> dict[str, Any]:
     """Return what a bug report needs, as plain JSON."""
     records, kernels = RecordLibrary().path, default_folder()
     return {
-        "dptse-env": dptse_env.__version__,
-        "digest": _code_digest(),
+        "dptse-env": code_version(),
         "folder": str(Path(dptse_env.__file__).parent),
         "python": sys.version.split()[0],
         "platform": platform.platform(),
@@ -94,7 +85,7 @@ def main(args: Args) -> None:
         return
     packages = found["packages"]
     lacking = [name for name, version in packages.items() if version is None]
-    print(f"dptse-env {found['dptse-env']} (code {found['digest']}) in {found['folder']}")
+    print(f"dptse-env {found['dptse-env']} in {found['folder']}")
     print(f"Python {found['python']}, {found['platform']}, {found['cores']} cores")
     for text in (
         ", ".join(f"{name}=={version}" for name, version in packages.items() if version),

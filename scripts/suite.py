@@ -3,7 +3,7 @@
 dptse suite speed-front --cells short
 
 Scores stand beside the best rule's; the mean is over all cells. What a folder has of an earlier
-run is not played again.
+run with equal numbers is not played again.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from pathlib import Path
 import polars as pl
 import tyro
 
-import dptse_env
 from agents.files import write_json
 from agents.play import Cell
 from agents.policies import policy_name
 from agents.studies import suite
 from agents.study import Study, play_study
+from agents.tables import are_present
 from agents.terminal import make_table, print_table
 from dptse_env.utils.fields import require, require_name
 from scripts.cli import Machines
@@ -48,7 +48,6 @@ def main(args: Args) -> None:
     """Play what was entered, write its card, and print scores."""
     require(bool(args.policies), "policies", "one or more", args.policies)
     others = [suite.read_card(path) for path in args.beside]
-    recorded = suite.recorded_rows()
     for name in args.cells:
         require_name("cells", name, list(suite.CELLS))
     cells = enter(args.policies, args.cells or tuple(suite.CELLS))
@@ -56,13 +55,14 @@ def main(args: Args) -> None:
     # A schedule by "module:Class" has a character that not every system allows in a path.
     folder = args.output or Path("results/my-suite") / entry.replace(":", "-")
     study = Study("suite", cells, suite.SEEDS, lambda rows, folder: "")
-    played = play_study(study, args.place(folder))
+    place, recorded = args.place(folder), suite.recorded_rows()
+    played = play_study(study, place)
     # The folder may have rows of other policies, of an earlier state of this one's file, and of
     # this one under another name.
     present = pl.col("cell").is_in([each.id for each in cells])
-    own = played.filter(present, version=dptse_env.__version__).with_columns(policy=pl.lit(entry))
+    own = played.filter(present, are_present(played)).with_columns(policy=pl.lit(entry))
     rows: pl.DataFrame = pl.concat([recorded, *others, own], how="diagonal_relaxed")
-    rows = rows.unique(("version", "policy", "name", "traffic_seed"), keep="last")
+    rows = rows.unique(("policy", "name", "traffic_seed"), keep="last")
     write_json(folder / CARD, suite.make_card(rows, entry, cells))
     print_scores(rows, [entry, *(each["policy"][0] for each in others)])
     print(f"the card is {folder / CARD}")

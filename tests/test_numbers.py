@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dptse_env import versions
 from tests import numbers
 
 pytestmark = pytest.mark.slow
@@ -50,3 +51,8 @@ def test_episodes(case, kept):
     function, arguments = {name: call for name, *call in numbers.cases()}[case]
     estimator = case.split()[-1] if case.startswith("errors") else ""
     compare(case, function(*arguments), kept, MEANS.get(estimator, 1e-6))
+
+
+def test_the_digest_of_this_code_is_declared_to_have_these_numbers():
+    *_, last = versions.EQUAL.read_text(encoding="utf-8").splitlines()
+    assert versions.digest() in last.split(), f"where the others pass, add it in {versions.EQUAL}"

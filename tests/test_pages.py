@@ -98,10 +98,12 @@ def test_every_file_states_the_same_version_and_repository():
         (ROOT / name).read_text(encoding="utf-8")
         for name in ("pyproject.toml", "CHANGELOG.md", "CITATION.cff")
     )
-    latest = re.search(r"^## \[(\d.*)\] - (.*)$", changelog, re.MULTILINE)
+    latest = re.search(r"^## \[?([\d.]+)\]? (?:- (.*)|\(unreleased\))$", changelog, re.MULTILINE)
     assert latest is not None
+    version, _, is_development = dptse_env.__version__.partition(".dev")
+    released = "" if is_development else f"date-released: {latest[2]}\n"
+    assert version == latest[1]
+    assert f"\nversion: {dptse_env.__version__}\n{released}license:" in citation
     stated = tomllib.loads(project)["project"]
-    assert stated["version"] == dptse_env.__version__ == latest[1]
-    assert f"\nversion: {latest[1]}\ndate-released: {latest[2]}\n" in citation
     repository = re.search(r"^repository-code: \"?([^\s\"]*)", citation, re.MULTILINE)
     assert stated.get("urls", {}).get("Repository") == (repository and repository[1])

@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,7 @@ from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import PrivacyReport
 from dptse_env.traffic import Record
 from dptse_env.utils.fields import require
+from dptse_env.versions import versions_with
 
 VIOLATION = math.sqrt(2.0)
 """Ratio of a true mu to the claimed one for which power is reported: noise divided by 1.41."""
@@ -132,7 +132,7 @@ class Finding:
             "detectable_mu": self.detectable if math.isfinite(self.detectable) else None,
             "privacy": self.privacy.to_dict(),
             "arguments": {key: str(value) for key, value in arguments.items()},
-            "versions": {name: version(name) for name in ("dptse-env", "numpy", "scipy")},
+            "versions": versions_with("numpy", "scipy"),
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, content)

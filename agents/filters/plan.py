@@ -10,7 +10,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
@@ -27,6 +26,7 @@ from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.recurrent import FORMAT, read_network
 from dptse_env.estimators.recurrent_kernels import CHANNELS
 from dptse_env.utils.fields import Interval, checked_fields, integer, require
+from dptse_env.versions import versions_with
 
 
 @dataclass(frozen=True)
@@ -249,7 +249,7 @@ class FilterPlan:
             "training": {
                 "plan": self.settings(),
                 "passes": done,
-                "versions": {each: version(each) for each in ("dptse-env", "torch", "numpy")},
+                "versions": versions_with("torch", "numpy"),
             },
         }
 

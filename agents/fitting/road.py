@@ -6,7 +6,6 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from dptse_env.traffic import (
 from dptse_env.traffic.imported import has_vehicles, recorded_seeds
 from dptse_env.traffic.sumo_input import network_xml
 from dptse_env.utils.fields import read_json, require
+from dptse_env.versions import code_version
 
 CHOSEN = ("parameters", "estimator", "estimator_settings")
 """Keywords of an environment that a fit decides."""
@@ -92,7 +92,7 @@ class Road:
             "keywords": self.keywords,
             "seeds": self.seeds,
             "tries": tries,
-            "dptse-env": version("dptse-env"),
+            "dptse-env": code_version(),
         }
         found: dict[str, Any] = json.loads(json.dumps(content))
         return found

@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import cached_property, partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +51,7 @@ from dptse_env.evaluation import Row
 from dptse_env.traffic import Records
 from dptse_env.utils.fields import from_mapping, require
 from dptse_env.utils.files import replacing
+from dptse_env.versions import code_version
 
 logger = logging.getLogger(__name__)
 
@@ -165,7 +165,7 @@ class Search:
             "parameters": dataclasses.asdict(config.arz_parameters),
             "seeds": self.seeds,
             "seed": self.seed,
-            "dptse-env": version("dptse-env"),
+            "dptse-env": code_version(),
             "also": self.also,
         }
 
@@ -247,7 +247,7 @@ def write(search: Search, study: optuna.Study, path: Path) -> dict[str, Any]:
         "rmse_speed": round(best.user_attrs["rmse_speed"], 2),
         "at_bounds": [path for path, knob in space.items() if at_bound(knob, best.params[path])],
         "date": date.today().isoformat(),
-        "version": version("dptse-env"),
+        "version": code_version(),
     }
     settings = nested(best.params)
     with replacing(path) as temporary:

@@ -27,7 +27,6 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-import dptse_env
 from agents.environments import quietly, unwrap
 from agents.figures import (
     COLOURS,
@@ -62,6 +61,7 @@ from agents.tables import (
 from dptse_env.evaluation import evaluate
 from dptse_env.rendering import History
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.versions import code_version
 
 ENV, SCHEDULE = "dptse_env:dptse/PaperHighway-v0", "paper"
 SEEDS = tuple(range(2000, 2020))
@@ -161,7 +161,7 @@ def measure_run_time(place: Place) -> pl.DataFrame:
         process = unwrap(env).process
         stopwatch = Stopwatch(process.estimator, ("predict", "update", "estimate"))
         timed.append((labels, env, process, stopwatch))
-    version, rows = {"version": dptse_env.__version__}, []
+    version, rows = {"version": code_version()}, []
     for seed in SEEDS[:N_TIMED]:
         for labels, env, process, stopwatch in timed:
             stopwatch.seconds = 0.0
@@ -177,7 +177,7 @@ def measure_space_time(place: Place) -> pl.DataFrame:
     rows = []
     for labels in once(labels_of(*pair, bandwidth=MAP_SEGMENTS) for pair in PAIRS):
         watched = watch(SCHEDULE, Cell(ENV, SCHEDULE, labels), SEEDS[0], place.records)
-        row = {"version": dptse_env.__version__, **labels}
+        row = {"version": code_version(), **labels}
         row |= {name: watched.row[name] for name in ("traffic_seed", DENSITY)}
         for name in ("truth", "estimate"):
             densities = np.array(getattr(watched.history, name))[::MAP_STEP]
@@ -201,7 +201,7 @@ Played = Mapping[tuple[Any, ...], pl.DataFrame]
 def by_cell(rows: pl.DataFrame, times: pl.DataFrame) -> Played:
     """Return the rows of each cell, with times of a step where there are."""
     names = list(CELLS[0].labels)
-    rows = rows.join(times.drop("version"), [*names, "traffic_seed"], how="left")
+    rows = rows.join(times.drop("version"), [*names, "traffic_seed"], "left", maintain_order="left")
     cells = rows.partition_by(names, as_dict=True)
     return {key: pick(found, dict(zip(names, key, strict=True))) for key, found in cells.items()}
 
@@ -210,7 +210,8 @@ def curves_of(played: Played, setting: str, *wanted: Curve) -> list[FloatArray]:
     """Return curves (n_points, n_seeds), paired by traffic seed.
 
     Raises:
-        UnmeasuredError: A cell was not played, or not by the version and on the seeds of the rest.
+        UnmeasuredError: A cell was not played, or not with the numbers and on the seeds of the
+            rest.
     """
     found: list[list[FloatArray]] = []
     origins = set()

@@ -22,7 +22,6 @@ import numpy as np
 import polars as pl
 from scipy import stats
 
-import dptse_env
 from agents.environments import make_config, quietly
 from agents.figures import GREY, finish_figure, make_figure, save_figure
 from agents.play import Cell
@@ -34,6 +33,7 @@ from agents.tables import (
     ERROR,
     Labels,
     UnmeasuredError,
+    are_present,
     below,
     cell,
     format_range,
@@ -48,6 +48,7 @@ from dptse_env.config import parse_seeds
 from dptse_env.parts import privacy_report
 from dptse_env.policies import shipped_policies
 from dptse_env.utils.fields import number, parse_json, require
+from dptse_env.versions import code_version, numbers_of
 
 NAME = "query-suite-v3"
 """Changes with anything that a score depends on."""
@@ -161,16 +162,17 @@ def recorded_rows() -> pl.DataFrame:
     """Return the rows that come with the package, as far as they are of this state of it.
 
     Raises:
-        ValueError: A reference was not played by this version, or with other weights of the
-            network.
+        ValueError: A reference was played with other numbers than those of this version, or with
+            other weights of the network.
     """
-    rows = _present(read_table(RECORDED / ROWS)).filter(version=dptse_env.__version__)
+    rows = _present(read_table(RECORDED / ROWS))
+    rows = rows.filter(are_present(rows))
     there = set(rows.select("policy", "name").iter_rows())
     for reference, name in product((ZERO, ONE), CELLS):
         if (reference, name) not in there:
             raise ValueError(
-                f"{RECORDED / ROWS} has no {reference} in the cell {name!r} by dptse-env "
-                f"{dptse_env.__version__}, so nothing can be scored; 'dptse study suite' in a "
+                f"{RECORDED / ROWS} has no {reference} in the cell {name!r} with the numbers of "
+                f"dptse-env {code_version()}, so nothing can be scored; 'dptse study suite' in a "
                 "checkout plays what is missing"
             )
     return rows
@@ -207,7 +209,7 @@ def score(rows: pl.DataFrame, policy: str, name: str) -> Score:
     values, by linearisation.
 
     Raises:
-        UnmeasuredError: No version has played the policy and both references, or the oracle is no
+        UnmeasuredError: The policy and both references have no equal numbers, or the oracle is no
             better than the round robin, so that there is no scale.
     """
     labels = ({"policy": each, "name": name} for each in (ZERO, policy, ONE))
@@ -300,10 +302,10 @@ def _labels(policy: str, name: str) -> Labels:
 
 
 def comparable() -> dict[str, str]:
-    """Return what cards must have in common to be compared: suite, package, and all cells."""
+    """Return what cards must have in common: suite, numbers of the package, and all cells."""
     content = [[name, each.id, each.seeds] for name, each in CELLS.items()]
     digest = hashlib.sha256(json.dumps(content).encode()).hexdigest()
-    return {"suite": NAME, "package": dptse_env.__version__, "cells": digest}
+    return {"suite": NAME, "package": code_version(), "cells": digest}
 
 
 def make_card(rows: pl.DataFrame, policy: str, cells: Sequence[Cell]) -> dict[str, Any]:
@@ -358,7 +360,7 @@ def read_card(path: Path) -> pl.DataFrame:
     if not isinstance(card, dict) or not {*comparable(), "policy", "errors"} <= card.keys():
         raise ValueError(f"{path} must be a card that 'dptse suite' wrote")
     for key, own in comparable().items():
-        if card[key] != own:
+        if card[key] != own and (key != "package" or numbers_of(f"{card[key]}") != numbers_of(own)):
             raise ValueError(
                 f"{path} cannot be compared: its {key} is {card[key]!r:.80}, here it is {own!r}"
             )
@@ -373,7 +375,7 @@ def read_card(path: Path) -> pl.DataFrame:
             error = number(float, by_seed[seed], f"{path}: errors[{name!r}][{seed!r}]", None)
             labels = _labels(policy, name)
             rows.append({**labels, "traffic_seed": int(seed), "reward": -error / 1000.0})
-    return pl.DataFrame(rows).with_columns(version=pl.lit(dptse_env.__version__))
+    return pl.DataFrame(rows).with_columns(version=pl.lit(code_version()))
 
 
 # The report on all that comes with the package.

@@ -7,7 +7,6 @@ import importlib
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,6 +29,7 @@ from dptse_env.utils.arrays import Action, AnyArray, BoolArray, FloatArray, Obse
 from dptse_env.utils.fields import integer, require_name
 from dptse_env.utils.files import require_arrays, write_tensors
 from dptse_env.utils.registry import needed_for, require_registered
+from dptse_env.versions import versions_with
 
 POLICY_FORMAT = "dptse-policy-2"
 """Format of the weights; its number is raised when saved weights change their meaning."""
@@ -375,9 +375,7 @@ def save_policy(
             "trained_on": describe_road(config.corridor),
             "estimator": ESTIMATORS.name_of(config.estimator),
             "epsilon": config.privacy.epsilon,
-            "versions": {
-                name: version(name) for name in ("dptse-env", "stable-baselines3", "torch")
-            },
+            "versions": versions_with("stable-baselines3", "torch"),
             "training": dict(training),
             "figures": dict(figures),
         }

@@ -10,6 +10,7 @@ from agents.executors import THIS_PROCESS, LocalProcesses
 from agents.play import Cell, play
 from agents.study import Place, Study, read_rows, run, write_report, write_table
 from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, values
+from dptse_env import versions
 from dptse_env.estimators.recurrent import read_network
 from tests.agents.faults import SHORT, TRACES, rows_of, study
 from tests.helpers import run_killed, save_untrained
@@ -51,19 +52,37 @@ def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
     assert rows.select("bandwidth", "traffic_seed").rows() == [
         (1, 2000), (1, 2001), (2, 2000), (2, 2001),
     ]  # fmt: skip
+    assert set(rows["version"]) == {versions.code_version()}
     assert rows["reward"].to_list() == [row["reward"] for row in expected]
     tables = (tmp_path / "tables.md").read_text("utf-8")
     assert f"| 1 | {rows['rmse_density'][:2].mean():.6f} |" in tables
     assert "| 9 | - |" in tables
     assert not (tmp_path / "rows").exists()
-    # Rows that are there are not played again, whatever their version, and the report is theirs.
+    assert calls == [tmp_path]
+
+
+def test_rows_of_equal_numbers_count_as_played_and_others_do_not(tmp_path, monkeypatch):
+    place, first = Place(tmp_path, THIS_PROCESS), small()
+    run(first, place, progress=False)
+    rows, own = rows_of(tmp_path), versions.code_version()
     old = rows.with_columns(version=pl.lit("0.1.0"), rmse_density=pl.lit(7.0))
     write_table(tmp_path / "rows.parquet", old)
-    run(replace(first, cells=(*first.cells, cell(3))), place, progress=False)
-    assert sorted(rows_of(tmp_path)["version"].to_list())[:4] == ["0.1.0"] * 4
-    assert "| 1 | 7.000000 |" in (tmp_path / "tables.md").read_text("utf-8")
-    assert "0.1.0 (4 episodes)" in (tmp_path / "tables.md").read_text("utf-8")
-    assert calls == [tmp_path]
+    with monkeypatch.context() as declared:
+        declared.setattr(versions, "equal_digests", lambda: {versions.digest(): "0.1.0"})
+        run(replace(first, cells=(*first.cells, cell(3))), place, progress=False)
+        tables = (tmp_path / "tables.md").read_text("utf-8")
+    assert read_rows("small", tmp_path)["version"].to_list() == ["0.1.0"] * 4 + [own] * 2
+    assert "| 1 | 7.000000 |" in tables
+    assert f"by dptse-env 0.1.0 (4 episodes) = {own} (2 episodes). " in tables
+    with pytest.warns(UserWarning, match=r"2 cells .* again: .* 0\.1\.0, whose numbers are not"):
+        run(first, place, progress=False)
+    assert read_rows("small", tmp_path)["version"].to_list() == ["0.1.0"] * 4 + [own] * 6
+    tables = (tmp_path / "tables.md").read_text("utf-8")
+    assert f"| 1 | {rows.filter(bandwidth=1)['rmse_density'].mean():.6f} |" in tables
+    assert f"by dptse-env 0.1.0 (4 episodes), {own} (6 episodes). " in tables
+    # Of rows of equal numbers for the same traffic there is one.
+    monkeypatch.setattr(versions, "equal_digests", lambda: {versions.digest(): "0.1.0"})
+    assert read_rows("small", tmp_path)["version"].to_list() == [own] * 6
 
 
 def test_cells_may_follow_from_rows(tmp_path):
@@ -135,25 +154,30 @@ def test_an_id_says_all_that_rows_depend_on(tmp_path):
     assert read_network("highway-flows").card["sha256"] in replace(first, keywords=keywords).id
 
 
-def test_pairs_are_of_one_version():
+def test_pairs_are_of_equal_numbers(monkeypatch):
     rows = pl.DataFrame(
         {
-            "version": ["0.2.0"] * 4 + ["0.10.0"] * 3,
+            "version": ["2+x"] * 4 + ["1+y"] * 3,
             "policy": ["a", "a", "b", "b", "a", "a", "c"],
             "traffic_seed": [1, 2, 1, 2, 1, 2, 1],
             "reward": [-0.1, -0.2, -0.2, -0.4, -0.3, -0.3, -0.5],
         }
     )
     a, b, c = ({"policy": name} for name in "abc")
-    assert values(rows, a, "error").tolist() == [300.0, 300.0]  # the last version has a, too
+    x, y = rows[:4], rows[4:]
+    assert values(rows, a, "error").tolist() == [300.0, 300.0]  # a was played again
     assert difference(rows, a, b, "error").mean == pytest.approx(-150.0)
     assert below(rows, a, b).mean == pytest.approx(50.0)
-    with pytest.raises(UnmeasuredError):
+    with pytest.raises(UnmeasuredError, match="by versions of equal numbers"):
         difference(rows, b, c, "error")
+    with pytest.raises(UnmeasuredError):
+        difference(pl.concat([x.filter(**b), y]), b, a, "error")
     with pytest.raises(UnmeasuredError):
         pick(rows, {"policy": "d"})
     with pytest.raises(ValueError, match="labels of several cells"):
-        pick(rows.filter(pl.col("version") == "0.2.0"), {})
+        pick(x, {})
+    monkeypatch.setattr(versions, "equal_digests", lambda: {"x": "x", "y": "x"})
+    assert difference(pl.concat([x.filter(**b), y]), b, a, "error").mean == pytest.approx(0.0)
 
 
 @pytest.fixture(scope="module")

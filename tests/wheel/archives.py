@@ -19,8 +19,8 @@ PACKAGES = {
     "results/suite/rows.parquet": "dptse_env/_tools/results/suite/rows.parquet",
 }
 """Folders and files of the repository that are in a wheel, and where."""
-IN_A_WHEEL = {"", ".json", ".parquet", ".py", ".safetensors", ".typed", ".xml"}
-"""Kinds of files of the packages: code, settings, networks, rows, policies."""
+IN_A_WHEEL = {"", ".json", ".parquet", ".py", ".safetensors", ".txt", ".typed", ".xml"}
+"""Kinds of files of the packages: code, settings, networks, rows, policies, equal digests."""
 
 FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}
 """Folders of a source archive."""

@@ -17,6 +17,8 @@ from pathlib import Path
 
 from archives import check_source, check_wheel
 
+from dptse_env.versions import code_version
+
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 SHORT = ["--env", "dptse_env:dptse/ShortHighway-v0"]
@@ -122,6 +124,8 @@ def use_package(installed: Installed, wheel: Path) -> None:
     installed.install(wheel, folder / "plugin")
     use = (installed.python, "-W", "error", *installed.ignored, HERE / "use.py")
     installed.run(*use, cwd=folder)
+    check = f"from dptse_env import versions; assert versions.code_version() == {code_version()!r}"
+    installed.run(installed.python, "-c", check, cwd=folder)
     installed.run(installed.python, HERE / "extras.py", cwd=folder)
     if not installed.lowest:
         # The lowest Gymnasium that is allowed must serve as well as the pinned one.
