@@ -186,12 +186,12 @@ def _play_cell(
     Raises:
         ValueError: A label is named like a measured column.
     """
-    cell, seeds = task
+    (cell, seeds), version = task, code_version()  # before an editor changes the code
     rows = play(cell, seeds, records, threads)
     clash = sorted(cell.labels.keys() & {*ORIGIN, *rows[0]})
     if clash:
         raise ValueError(f"labels must differ from the names of columns, got {clash[0]!r}")
-    head = dict(zip(ORIGIN, (study, code_version(), cell.id), strict=True))
+    head = dict(zip(ORIGIN, (study, version, cell.id), strict=True))
     rows = [{**head, **cell.labels, **row} for row in rows]
     return pl.DataFrame(rows, infer_schema_length=None)
 

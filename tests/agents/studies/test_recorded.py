@@ -1,4 +1,4 @@
-"""Recorded studies: nothing is left to play, and their tables and figures are those of their rows.
+"""Recorded studies: every cell was played, and tables and figures are those of the rows.
 
 What a study makes of its rows is tested beside this, study by study.
 """
@@ -22,7 +22,7 @@ def study(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nothing_is_left_to_play(name, tmp_path):
+def test_every_cell_was_played(name, tmp_path):
     rows = read_rows(name, RESULTS / name)
     follow = study(name).follow
     cells = [*study(name).cells, *(follow(rows, tmp_path) if follow else ())]
