@@ -465,8 +465,8 @@ MUTANTS = (
     ),
     Mutant(
         "noise comes again after its block", 17, "release/noise.py",
-        'was released before its first reset")\n            self._draw(row, generator)',
-        'was released before its first reset")\n            self._next[row] = 0',
+        "                )\n            self._draw(row, generator)",
+        "                )\n            self._next[row] = 0",
         "release/test_noise.py",
     ),
     Mutant(
@@ -524,6 +524,21 @@ MUTANTS = (
         "a process with secure noise can be forked", 18, "process.py",
         'if self.config.privacy.noise == "secure":', "if False:",
         "test_streams.py",
+    ),
+    Mutant(
+        "a copy has the secure noise of its origin", 18, "release/noise.py",
+        "if self._is_secure else self\n", "if False else self\n",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "a forked process has the secure noise of its origin", 18, "release/noise.py",
+        "_SECURE.add(self)", "pass",
+        "release/test_noise.py",
+    ),
+    Mutant(
+        "a number that is settled moves the stream", 17, "release/noise.py",
+        "child = generator.spawn(1)[0]", "child = generator",
+        "release/test_noise.py",
     ),
     Mutant(
         "a seeded guarantee does not say so", 18, "release/base.py",

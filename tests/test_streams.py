@@ -1,5 +1,7 @@
 """An episode follows its seed alone, whatever was before it, and its score the record's second."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess, ResetOptions
 from dptse_env.release.noise import grid_of
 from dptse_env.traffic import RecordLibrary
-from tests.helpers import SumRelease, assert_same, make_env, play
+from tests.helpers import SumRelease, assert_same, make_batch, make_env, play
 
 TWO = np.arange(2)
 EVERYWHERE = {"traffic_seed": 0, "start": 0}
@@ -150,3 +152,24 @@ def test_secure_noise_takes_no_seed_and_has_no_forks(preset):
         process.fork()
     with pytest.raises(ValueError, match=r"^privacy\.noise must be 'seeded' with"):
         begin((1, 2), EVERYWHERE, privacy={"preset": SumRelease, "noise": "secure"})
+
+
+@pytest.mark.parametrize("preset", ["paced", "capped"])
+def test_a_copy_with_secure_noise_must_begin_new_episodes(preset):
+    """Otherwise its vehicles would pay once in the copy and once in its origin."""
+    env = make_batch(privacy={"preset": preset, "noise": "secure"}, estimator="random_walk")
+    actions, unused = np.ones((3, 6), dtype=np.int8), copy.deepcopy(env)
+    for each in (env, unused):
+        each.reset(seed=0)
+        each.step(actions)
+    twin, released = copy.deepcopy(env), []
+    with pytest.raises(RuntimeError, match="^episode 0 must be reset"):
+        twin.step(actions)
+    twin.reset(options={"reset_mask": np.array([True, True, False])})
+    with pytest.raises(RuntimeError, match="^episode 2 must be reset"):
+        twin.step(actions)
+    for each in (env, twin):
+        each.reset(seed=0)
+        each.step(actions)
+        released.append(each.process.released[:, :2])
+    assert (released[0] != released[1]).mean() > 0.99

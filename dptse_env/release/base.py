@@ -54,7 +54,8 @@ class PrivacySettings:
             ``private``; None for the model's default.
         noise: Source of the noise: ``seeded``, the episode's stream, for simulation, or ``secure``,
             the operating system's randomness, which nobody can repeat. Both have exactly the same
-            distribution. A process with secure noise has no forks, whose releases would share it.
+            distribution. An episode with secure noise stays where it began: its process has no
+            `fork`, and a copy, a pickle or an operating system's fork must reset it.
 
     Raises:
         ValueError: A field is out of range; the message names its path below ``privacy``.

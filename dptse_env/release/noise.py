@@ -15,9 +15,11 @@ further bits and digits as it takes (`rounded_normal`).
 
 from __future__ import annotations
 
+import copy
 import os
+import weakref
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import mpmath
 import numpy as np
@@ -117,7 +119,12 @@ class Noise:
     Noise is drawn for all columns of all groups at every step, observed or not: different policies
     on the same streams have common random numbers, and an episode's noise depends neither on its
     batch nor on the other episodes.
+
+    A copy of seeded noise repeats it. A copy of secure noise, a pickled one, or that of a forked
+    process has none until its episodes are reset, since ledgers would be spent twice, too.
     """
+
+    __copy__ = copy.deepcopy  # two that share a block would not know which step is unused
 
     def __init__(
         self, n_episodes: int, n_columns: int, source: NoiseSource = "seeded", scale: float = 1.0
@@ -128,14 +135,20 @@ class Noise:
         """
         self._is_secure, self._scale = source == "secure", scale
         self._generators: list[np.random.Generator | None] = [None] * n_episodes
-        self._bits: Bits = np.empty((n_episodes, BLOCK, n_columns, 2), dtype=np.uint64)
-        self._normal = np.empty(self._bits.shape)
+        self._bits: Bits = np.zeros((n_episodes, BLOCK, n_columns, 2), dtype=np.uint64)
+        self._normal = np.zeros(self._bits.shape)
         # Next unused step of each block. An episode that was never reset has a used-up block, so
         # that it cannot be released without noise.
         self._next = np.full(n_episodes, BLOCK)
         # Steps for which every block certainly has noise: saves a look at `_next` at each step.
         self._sure = 0
         self._given: FloatArray | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle has: of secure noise, that of no episode."""
+        n_episodes, _, n_columns, _ = self._bits.shape
+        made = Noise(n_episodes, n_columns, "secure", self._scale) if self._is_secure else self
+        return vars(made)
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
         """Begin new episodes (k,), with one stream for each, which secure noise leaves unused.
@@ -182,7 +195,7 @@ class Noise:
             unit: What released values are divided by, shape (C,).
 
         Raises:
-            RuntimeError: An episode was never reset.
+            RuntimeError: An episode was never reset, or is a copy whose noise is secure.
         """
         if self._sure <= 0:
             self._refill(episodes)
@@ -231,18 +244,35 @@ class Noise:
         for row in episodes[self._next[episodes] == BLOCK].tolist():
             generator = self._generators[row]
             if generator is None:
-                raise RuntimeError(f"episode {row} was released before its first reset")
+                raise RuntimeError(
+                    f"episode {row} must be reset before it is released: it never was, or its "
+                    "secure noise stayed with the process that it was copied or forked from"
+                )
             self._draw(row, generator)
         self._sure = BLOCK - int(self._next.max())
 
     def _draw(self, row: int, generator: np.random.Generator) -> None:
         bits = self._bits[row]
         if self._is_secure:
+            _SECURE.add(self)
             bits[:] = np.frombuffer(os.urandom(bits.nbytes), dtype=np.uint64).reshape(bits.shape)
         else:
             bits[:] = generator.integers(2**64, size=bits.shape, dtype=np.uint64)
         self._normal[row] = normal_of(bits)
         self._next[row] = 0
+
+    def _forget(self) -> None:
+        """Leave all episodes without noise, as they were before their first reset."""
+        self._generators[:] = [None] * len(self._generators)
+        self._next[:] = BLOCK
+        self._sure = 0
+
+
+_SECURE: weakref.WeakSet[Noise] = weakref.WeakSet()
+"""The secure noise that this process has drawn, which is not a forked one's to use."""
+
+if hasattr(os, "register_at_fork"):  # Windows has no forks
+    os.register_at_fork(after_in_child=lambda: [noise._forget() for noise in _SECURE])
 
 
 @kernel

@@ -1,6 +1,10 @@
 """Noise of releases: its distribution, streams and grid, each with mutations that fail."""
 
+import copy
 import math
+import pickle
+import subprocess
+import sys
 
 import mpmath
 import numpy as np
@@ -128,9 +132,15 @@ def test_exact_and_fast_noise_agree_wherever_the_fast_one_is_certain(scale):
 
 def test_where_all_noise_is_in_doubt_releases_are_the_same(monkeypatch):
     """Each number is then settled by itself, and the stream goes on as if none had been."""
-    certain = drawn(started(1), 3, ONE)
+    certain = drawn(started(1), BLOCK + 1)
     monkeypatch.setattr(module, "DOUBT", 1.0)
-    np.testing.assert_array_equal(drawn(started(1), 3, ONE), certain)
+
+    def settled(scale, bits, more):
+        assert more() != more()
+        return rounded_normal(scale, bits, more)
+
+    monkeypatch.setattr(module, "rounded_normal", settled)
+    np.testing.assert_array_equal(drawn(started(1), BLOCK + 1), certain)
 
 
 def test_just_what_an_error_could_take_to_another_integer_and_what_is_far_is_settled(monkeypatch):
@@ -173,6 +183,67 @@ def test_secure_noise_takes_no_seed():
     assert first._further(0)() != second._further(0)()
 
 
+COPIES = {
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda noise: pickle.loads(pickle.dumps(noise)),
+    "copy of a copy": lambda noise: copy.deepcopy(copy.copy(noise)),
+}
+
+
+@pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
+def test_a_copy_repeats_seeded_noise_and_has_none_of_secure_noise(copied):
+    seeded = started(1, 2)
+    drawn(seeded, 3, [0, 1])
+    np.testing.assert_array_equal(drawn(copied(seeded), 70, [1, 0]), drawn(seeded, 70, [1, 0]))
+    secure = Noise(2, S, "secure", scale=3.0)
+    secure.reset(np.arange(2), streams(1, 2))
+    drawn(secure, 3, [0, 1])
+    left = secure._bits.copy()
+    for twin in (copied(secure), copied(secure)):
+        assert not np.intersect1d(twin._bits, left).any()
+        twin.reset(ONE, streams(1))
+        assert drawn(twin, 1).std() > 2.0 * SIGMA.mean()  # it has the scale
+        with pytest.raises(RuntimeError, match=r"^episode 1 must be reset before it is released"):
+            drawn(twin, 1, [1])
+    np.testing.assert_array_equal(secure._bits, left)
+    drawn(secure, 70, [0, 1])
+
+
+FORKED = """
+import os
+import numpy as np
+from dptse_env.release.noise import Noise
+
+def release():
+    noise.added(np.arange(1), np.zeros((1, 3, 2)), np.ones((1, 3, 2)), np.ones(3))
+
+for source in ("secure", "seeded"):
+    noise = Noise(1, 3, source)
+    noise.reset(np.arange(1), [np.random.default_rng(0)])
+    release()
+    if os.fork() == 0:
+        try:
+            release()
+        except RuntimeError:
+            noise.reset(np.arange(1), [np.random.default_rng(0)])
+            release()
+            os._exit(7)
+        os._exit(8)
+    release()
+    print(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(module.os, "fork"), reason="this system has no forks")
+def test_a_forked_process_has_none_of_the_secure_noise_and_its_origin_goes_on():
+    """From a process that has no threads, as a fork should."""
+    found = subprocess.run(
+        [sys.executable, "-c", FORKED], capture_output=True, text=True, check=False
+    )
+    assert found.stdout.split() == ["7", "8"], found.stderr
+
+
 # --- streams ---------------------------------------------------------------------------------
 
 
@@ -198,11 +269,11 @@ def test_an_episode_has_its_own_stream_in_any_batch_and_interleaving(data, n_epi
 
 def test_nothing_is_released_before_the_first_reset():
     noise = Noise(3, S)
-    with pytest.raises(RuntimeError, match="episode 0 was released before its first reset"):
+    with pytest.raises(RuntimeError, match="^episode 0 must be reset before it is released: it "):
         drawn(noise, 1)
     noise.reset(np.array([0, 2]), streams(1, 2))
     drawn(noise, 70, [0, 2])
-    with pytest.raises(RuntimeError, match="episode 1 was released before its first reset"):
+    with pytest.raises(RuntimeError, match="^episode 1 must be reset before it is released: it "):
         drawn(noise, 1, [1])
     with pytest.raises(ValueError, match="shorter"):
         noise.reset(np.arange(2), streams(1))

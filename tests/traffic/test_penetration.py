@@ -64,6 +64,9 @@ def test_the_connected_vehicles_report_and_some_misreport_their_speed():
     factor = speeds[reported] / (10.0 + record.vehicle[reported])
     assert set(np.round(factor, 3).tolist()) == {1.0, 2.0}
     assert abs((factor > 1.5).mean() - 0.25) < 0.06
+    half = Penetration(misreporting=0.5, misreport_factor=2.0)
+    wrong = [half.speeds(seed, record) > record.speed for seed in (7, 8)]
+    assert 0.4 < (wrong[0] == wrong[1]).mean() < 0.6
 
 
 IMPOSSIBLE = [
