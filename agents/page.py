@@ -16,6 +16,7 @@ from agents.figures import COLOURS
 from agents.play import Cell
 from agents.tables import error_label
 from dptse_env.evaluation import Row, evaluate
+from dptse_env.privacy import rounded_up
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import DENSITY_MAP, History
 from dptse_env.traffic import Records
@@ -197,7 +198,7 @@ def _profile(go: Any, episodes: Sequence[Watched], middles: FloatArray, second: 
     for k, each in enumerate(episodes):
         error = {"type": "data", "array": (1.96 * each.density_std[second]).round(1)}
         rmse, epsilon = each.history.rmse[second], each.epsilon[second]
-        loss = f", ε {epsilon:.2f}" if math.isfinite(epsilon) else ""
+        loss = f", ε {rounded_up(epsilon, '.2f')}" if math.isfinite(epsilon) else ""
         traces.append(
             go.Scatter(
                 x=middles,

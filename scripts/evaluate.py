@@ -42,6 +42,7 @@ from agents.tables import (
 from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import parse_seeds
 from dptse_env.policies import DETERMINISTIC
+from dptse_env.privacy import rounded_up
 from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import require
@@ -282,7 +283,8 @@ def make_title(cell: Cell, seeds: Sequence[int]) -> str:
     """Return what is evaluated, in words, given one of the cells."""
     config = make_config(cell.env, cell.keywords)
     model = f"parameters {config.arz_parameters.name}, release model {config.privacy.preset}"
-    privacy = f"epsilon {config.privacy.epsilon:g}, delta {config.privacy.delta:g}"
+    epsilon, delta = config.privacy.epsilon, config.privacy.delta
+    privacy = f"epsilon {rounded_up(epsilon)}, delta {rounded_up(delta)}"
     traffic = f"{len(seeds)} episode{'s' * (len(seeds) > 1)} on {seed_kind(seeds)} traffic"
     return f"{cell.env.rpartition('/')[2]}, {model} ({privacy}), {traffic}"
 

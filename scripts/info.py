@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import dptse_env
-from dptse_env.privacy import DELTAS, over_trips
+from dptse_env.privacy import DELTAS, over_trips, rounded_up
 from dptse_env.traffic import RecordLibrary
 from dptse_env.traffic.library import CACHE_VARIABLE
 from dptse_env.utils.kernels import default_folder
@@ -100,7 +100,7 @@ def main(args: Args) -> None:
 
 
 def _print_trips(account: dict[int, dict[str, float]]) -> None:
-    print(f"trips       mu  epsilon at delta = {'      '.join(DELTAS)}")
+    print(f"trips       mu  epsilon at delta = {'      '.join(DELTAS)}")  # all rounded up
     for trips, row in account.items():
-        epsilons = "".join(f"{row[delta]:10.1f}" for delta in DELTAS)
-        print(f"{trips:5} {row['mu']:8.3f}{'':15}{epsilons}")
+        epsilons = "".join(rounded_up(row[delta], "10.1f") for delta in DELTAS)
+        print(f"{trips:5} {rounded_up(row['mu'], '8.3f')}{'':15}{epsilons}")

@@ -629,9 +629,9 @@ MUTANTS = (
         "release/test_gaussian.py",
     ),
     Mutant(
-        "a guarantee states mu rounded down", 21, "release/base.py",
-        "math.ceil(1e4 * mu)", "math.floor(1e4 * mu)",
-        "release/test_paced.py",
+        "a guarantee states mu rounded down", 21, "privacy/gaussian.py",
+        "localcontext(rounding=ROUND_CEILING)", "localcontext(rounding='ROUND_FLOOR')",
+        "privacy/test_gaussian.py",
     ),
     Mutant(
         "the reserve is smaller than the rounding of ledgers", 22, "privacy/gaussian.py",

@@ -27,6 +27,7 @@ from agents.statistics import mean_interval
 from agents.study import Place
 from agents.tables import DENSITY, ERROR, SPEED, Labels, give_or_take, pick, values_of
 from dptse_env.model import ARZParameters
+from dptse_env.privacy import rounded_up
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import FloatArray
 
@@ -163,7 +164,7 @@ def write(outcome: Outcome, rows: Sequence[Labels], place: Place) -> str:
         f"<h1>{escape(corridor.name)}</h1>",
         f"<p class='answer'>{escape(answer(choice))}</p>",
         f"<p>{escape(road.env.rpartition('/')[2])}, release model {escape(str(privacy.preset))} "
-        f"with ε = {privacy.epsilon:g} and δ = {privacy.delta:g}, "
+        f"with ε = {rounded_up(privacy.epsilon)} and δ = {rounded_up(privacy.delta)}, "
         f"bandwidth {road.config.bandwidth}. The estimator, the parameters and the "
         "rule were chosen on validation traffic; all errors below are of test traffic, which was "
         f"played once. {escape(intervals)} χ² is the mean square of errors over the reported "

@@ -51,7 +51,7 @@ from agents.tables import (
 from agents.watchers import LENGTHS
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
-from dptse_env.privacy import epsilon_of, mu_of
+from dptse_env.privacy import epsilon_of, mu_of, rounded_up
 from dptse_env.release import Paced, Pacing, ReleaseModel, Task, Traffic
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
@@ -324,7 +324,7 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
     yield compared(ask, "(rung)", ladder, REFUSED)
     yield f"## Ladder at other (ε, δ): {ERRORS[DENSITY]}"
     at = {
-        f"({e:g}, {d:g}), μ = {mu_of(e, d):.2f}": {"epsilon": e, "delta": d} for e, d in GUARANTEES
+        f"({e:g}, {d:g}), μ = {rounded_up(mu_of(e, d), '.2f')}": {"epsilon": e, "delta": d} for e, d in GUARANTEES
     }
     again = {name: (DENSITY, partial(paid, **changes)) for name, changes, _ in LADDER}
     yield sweep(ask, "rung", at, again)

@@ -47,6 +47,7 @@ from agents.tables import (
 from dptse_env.config import parse_seeds
 from dptse_env.parts import privacy_report
 from dptse_env.policies import shipped_policies
+from dptse_env.privacy import rounded_up
 from dptse_env.utils.fields import number, parse_json, require
 from dptse_env.versions import code_version, numbers_of
 
@@ -434,8 +435,11 @@ def _cell_table() -> str:
     def guarantee(each: Cell) -> str:
         with quietly():
             found = privacy_report(make_config(each.env, each.keywords))
-        pair = f"μ = {found.mu:.2f}, ({found.epsilon:.4g}, {found.claimed_delta:g})"
-        return f"none: {pair}" if found.void_reasons else pair
+        # What is guaranteed is the configured epsilon: that of mu may be a digit off.
+        epsilon = found.epsilon if found.void_reasons else found.claimed_epsilon
+        pair = f"({rounded_up(epsilon, '.4g')}, {rounded_up(found.claimed_delta)})"
+        stated = f"μ = {rounded_up(found.mu, '.2f')}, {pair}"
+        return f"none: {stated}" if found.void_reasons else stated
 
     header = ["cell", "environment", "traffic seeds", "guarantee"]
     return markdown(

@@ -14,6 +14,7 @@ from dptse_env.privacy.gaussian import (
     over_trips,
     printed_noise_std,
     require_covered,
+    rounded_up,
     single_noise_std,
 )
 from dptse_env.privacy.sensitivity import (
@@ -43,5 +44,6 @@ __all__ = [
     "paper_sensitivity",
     "printed_noise_std",
     "require_covered",
+    "rounded_up",
     "single_noise_std",
 ]

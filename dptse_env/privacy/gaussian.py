@@ -19,6 +19,7 @@ $b$, so the second term is $\varphi(a)$ times a ratio that stays of order one.
 
 import math
 from collections.abc import Sequence
+from decimal import ROUND_CEILING, Decimal, localcontext
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -125,6 +126,13 @@ def over_trips(mu: float, trips: Sequence[int] = TRIPS) -> dict[int, dict[str, f
     """
     mus = {n: positive("mu", mu) * math.sqrt(integer("trips", n, 1)) for n in trips}
     return {n: {"mu": total, **epsilons_of(total)} for n, total in mus.items()}
+
+
+def rounded_up(loss: float, form: str = ".5g") -> str:
+    """Return a privacy loss as text of a format, which states no less than there is."""
+    with localcontext(rounding=ROUND_CEILING):
+        rounded = float(format(Decimal(repr(float(loss))), form))
+    return format(rounded, form)
 
 
 def mu_of(epsilon: float, delta: float) -> float:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dptse_env.estimators import Estimate, Measurement
 from dptse_env.model import MeasurementRows
 from dptse_env.model.network import covered
-from dptse_env.privacy import Adjacency
+from dptse_env.privacy import Adjacency, rounded_up
 from dptse_env.release.noise import NoiseSource
 from dptse_env.release.queries import QueryOptions
 from dptse_env.release.report import PrivacyReport
@@ -82,9 +82,9 @@ class PrivacySettings:
         """Return the sentence that states mu and (epsilon, delta), and what is protected."""
         against = "" if self.noise == "secure" else ", against whoever does not know the seed"
         return (
-            f"{math.ceil(1e4 * mu) / 1e4:g}-Gaussian differential privacy, which is "
-            f"({self.epsilon:g}, {self.delta:g})-differential privacy, of {quantities} together, "
-            f"for {protected}{against}"
+            f"{rounded_up(mu)}-Gaussian differential privacy, which is ({rounded_up(self.epsilon)}, "
+            f"{rounded_up(self.delta)})-differential privacy, of {quantities} together, for "
+            f"{protected}{against}"
         )
 
 

@@ -25,6 +25,7 @@ from dptse_env.privacy import (
     paper_sensitivity,
     printed_noise_std,
     require_covered,
+    rounded_up,
     single_noise_std,
 )
 
@@ -251,6 +252,16 @@ def test_an_account_charges_a_step_for_each_contribution_and_the_paper_s_all_at_
     assert whole.spent(np.array([0, 7]))[0].tolist() == [2.0, 2.0]
     found = account.epsilons(np.array([0.0, 1.0, 4.0, 9.0]))
     assert found == pytest.approx(epsilon.tolist())
+
+
+@few
+@given(loss=logarithmic(1e-6, 1e6), form=st.sampled_from([".5g", ".2f"]))
+@example(loss=139.793097, form=".5g")
+def test_a_loss_as_text_states_no_less_than_there_is_and_little_more(loss, form):
+    text = rounded_up(loss, form)
+    assert text == format(float(text), form)
+    assert loss <= float(text) < loss + max(1e-4 * loss, 0.01 * (form == ".2f"))
+    assert rounded_up(float(text), form) == text
 
 
 def test_trips_of_one_vehicle_compose():

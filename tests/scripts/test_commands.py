@@ -149,7 +149,7 @@ def test_information_on_trips_is_a_row_for_each_number_of_them():
     header, *rows = [
         row.split() for row in run_command("info", "--mu", "2.118").stdout.splitlines()
     ]
-    assert rows[2] == ["10", "6.698", "37.2", "42.3", "46.5", "50.2", "53.5"]
+    assert rows[2] == ["10", "6.698", "37.2", "42.4", "46.6", "50.3", "53.6"]
     assert header[-len(rows[2]) + 2 :] == list(DELTAS)
     found = json.loads(run_command("info", "--mu", "2.118", "--json").stdout)
     assert list(found) == [row[0] for row in rows] == ["1", "2", "10", "50", "250"]
