@@ -35,7 +35,7 @@ TOKENS = (
     b"99999999999999999999", b'"', b'""', b'"a\\nb"', b'"no_such_module:Part"', b"'", b"[" * 3000,
     b"{" * 3000, b'{"a":' * 3000, b"]", b"}", b"=", b",", b"<", b"null", b"true", b"x" * 10_000,
     b"\0", b"\xff\xfe", b"\r", b"\n", b"", b"1", b"2", b"3", b"7.5", b"0.2", b"100", b"true",
-    b"1", b"2", b"0.5", b"60",
+    b"1", b"2", b"0.5", b"60", b"9" * 300,
 )  # fmt: skip
 """Substitutes for a word of a text, or a few bytes of it; some of them may be in order."""
 

@@ -196,9 +196,9 @@ MUTANTS = (
         "release/test_vehicles.py",
     ),
     Mutant(
-        "a record of too many vehicles is not refused", 5, "release/vehicles.py",
-        "record.n_vehicles <= MOST_VEHICLES,", "True,",
-        "release/test_vehicles.py",
+        "a record of too many vehicles is not refused", 5, "traffic/record.py",
+        '"vehicle": MOST_VEHICLES}', '"vehicle": 2**31}',
+        "traffic/test_record.py",
     ),
     Mutant(
         "a sum is no multiple of the grid", 5, "release/vehicles.py",
@@ -410,7 +410,7 @@ MUTANTS = (
     ),
     Mutant(
         "integers in doubt are not settled", 16, "release/noise.py",
-        "if some_open and given is None:", "if False:",
+        "if n_open > 0 and given is None:", "if False:",
         "release/test_noise.py",
     ),
     Mutant(

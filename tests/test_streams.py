@@ -163,10 +163,10 @@ def test_a_copy_with_secure_noise_must_begin_new_episodes(preset):
         each.reset(seed=0)
         each.step(actions)
     twin, released = copy.deepcopy(env), []
-    with pytest.raises(RuntimeError, match="^episode 0 must be reset"):
+    with pytest.raises(RuntimeError, match=r"^episode 0 must be reset"):
         twin.step(actions)
     twin.reset(options={"reset_mask": np.array([True, True, False])})
-    with pytest.raises(RuntimeError, match="^episode 2 must be reset"):
+    with pytest.raises(RuntimeError, match=r"^episode 2 must be reset"):
         twin.step(actions)
     for each in (env, twin):
         each.reset(seed=0)

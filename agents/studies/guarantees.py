@@ -324,7 +324,8 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
     yield compared(ask, "(rung)", ladder, REFUSED)
     yield f"## Ladder at other (ε, δ): {ERRORS[DENSITY]}"
     at = {
-        f"({e:g}, {d:g}), μ = {rounded_up(mu_of(e, d), '.2f')}": {"epsilon": e, "delta": d} for e, d in GUARANTEES
+        f"({e:g}, {d:g}), μ = {rounded_up(mu_of(e, d), '.2f')}": {"epsilon": e, "delta": d}
+        for e, d in GUARANTEES
     }
     again = {name: (DENSITY, partial(paid, **changes)) for name, changes, _ in LADDER}
     yield sweep(ask, "rung", at, again)

@@ -38,6 +38,13 @@ GRID_SHARE = 2.0**-10
 COARSEST = 1.0
 """Largest spacing of the grid, so that a vehicle counts as 1, and its speed in km/h as finely."""
 
+LARGEST_SIGMA = 2.0**49
+"""Largest standard deviation of noise [vehicles, km/h].
+
+With sums below 2^52 steps of the grid, as other limits have it, releases are exact in double
+precision up to it: 64 bits are no further out than 9.2 deviations.
+"""
+
 BLOCK = 32
 """Seconds for which noise is drawn at a time; a large draw costs far less than many small ones."""
 
@@ -98,10 +105,13 @@ def rounded_normal(scale: float, bits: int, more: Callable[[], int]) -> int:
             error = mpmath.ldexp(1, -size - 32)
             # The probabilities of a number beyond either border of the integer.
             outer, inner = (_beyond(scale, found + side) for side in (0.5, -0.5))
+            # Newton's step towards the middle of the interval.
+            missing = _beyond(scale, found) - (least + most) / 2
+            step = max(1, int(abs(missing) / mpmath.npdf(found, 0, scale)))
             if least > inner + error:
-                found -= 1
+                found -= step
             elif most < outer - error:
-                found += 1
+                found += step
             elif outer + error < least and most < inner - error:
                 return -found if bits & 1 else found
             else:
@@ -191,10 +201,12 @@ class Noise:
             episodes: Shape (k,).
             values: What noise is added to, shape (k, C, 2): multiples of `grid_of` the deviation
                 where a guarantee is to hold; others are rounded to it.
-            sigma: Standard deviations of the noise, shape (k, C, 2).
+            sigma: Standard deviations of the noise, above 0 and up to `LARGEST_SIGMA`, shape
+                (k, C, 2).
             unit: What released values are divided by, shape (C,).
 
         Raises:
+            ValueError: A standard deviation is out of range.
             RuntimeError: An episode was never reset, or is a copy whose noise is secure.
         """
         if self._sure <= 0:
@@ -204,11 +216,16 @@ class Noise:
         if given is not None:
             self._normal[episodes, self._next[episodes]] = given[episodes]
         released, open_ = np.empty(values.shape), np.empty(values.shape, dtype=np.bool_)
-        some_open = _add(
+        n_open = _add(
             self._normal, self._next, episodes, values, self._scale, sigma, unit, DOUBT, released,
             open_,
         )  # fmt: skip
-        if some_open and given is None:
+        if n_open < 0:
+            raise ValueError(
+                "privacy.epsilon must be such that noise has standard deviations in "
+                f"(0, {LARGEST_SIGMA:.3g}], got {sigma.min():.3g} to {sigma.max():.3g}"
+            )
+        if n_open > 0 and given is None:
             self._settle(episodes, values, sigma, unit, released, open_)
         return released
 
@@ -287,9 +304,17 @@ def _add(
     doubt: float,
     released: FloatArray,
     open_: BoolArray,
-) -> bool:
-    """Write releases, and which of them double precision leaves open; return if any is."""
-    some_open = False
+) -> int:
+    """Write releases, and which of them double precision leaves open; return how many.
+
+    That is negative, and nothing is done, where a deviation is out of range.
+    """
+    for k in range(episodes.size):
+        for c in range(unit.size):
+            for q in range(2):
+                if not 0.0 < sigma[k, c, q] <= LARGEST_SIGMA:
+                    return -1
+    n_open = 0
     for k in range(episodes.size):
         step = next_[episodes[k]]
         next_[episodes[k]] += 1
@@ -303,6 +328,6 @@ def _add(
                 margin = 0.5 - abs(ratio * z - steps)
                 is_open = size > FAR or margin < ratio * (1.0 + size) * doubt
                 open_[k, c, q] = is_open
-                some_open |= is_open
+                n_open += is_open
                 released[k, c, q] = (np.rint(values[k, c, q] / grid) + steps) * grid / unit[c]
-    return some_open
+    return n_open

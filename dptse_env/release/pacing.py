@@ -32,6 +32,9 @@ SLOWEST, FASTEST = 8.0, 102.0
 MARGIN = 2.0
 """Queried seconds added to those that are expected for the rest of a trip [s]."""
 
+LEAST_PRICE = 2.0**-76
+"""Least price of a pacing [1/veh^2]: noise, of flows too, stays below `LARGEST_SIGMA`."""
+
 MEMORY = 60.0
 """Time constant of the average by which rates of querying follow the queries [s]."""
 
@@ -117,7 +120,7 @@ class Pacing(ABC):
     def prices(
         self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
     ) -> FloatArray:
-        """Return the price [1/veh^2] of every column, positive and finite, shape (k, C).
+        """Return the price [1/veh^2] of every column, `LEAST_PRICE` or more, shape (k, C).
 
         It is called once for every second, before its release.
 
@@ -248,7 +251,7 @@ def check_prices(prices: Any, shape: tuple[int, ...]) -> FloatArray:
     """Return the prices of a pacing; refuse those that are malformed.
 
     Raises:
-        ValueError: Their shape is wrong, or one is not positive and finite.
+        ValueError: Their shape is wrong, or one is below `LEAST_PRICE` or not finite.
     """
     array = np.asarray(prices)
     if array.shape != shape or array.dtype.kind != "f":
@@ -256,8 +259,11 @@ def check_prices(prices: Any, shape: tuple[int, ...]) -> FloatArray:
             f"privacy.pacing must return floats of shape {shape}, got {array.dtype} of shape "
             f"{array.shape}"
         )
-    if not ((array > 0.0) & np.isfinite(array)).all():
-        raise ValueError("privacy.pacing must return prices that are positive and finite")
+    bad = array[~((array >= LEAST_PRICE) & np.isfinite(array))]
+    if bad.size:
+        raise ValueError(
+            f"privacy.pacing must return finite prices >= {LEAST_PRICE:.3g}, got {bad[0]:.3g}"
+        )
     return array
 
 

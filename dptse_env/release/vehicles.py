@@ -23,13 +23,10 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from dptse_env.release.noise import grid_of
-from dptse_env.traffic import Corridor, Penetration, Record, RecordLibrary
+from dptse_env.traffic import MOST_VEHICLES, Corridor, Penetration, Record, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import require
 from dptse_env.utils.kernels import kernel
-
-MOST_VEHICLES = 2**20
-"""Largest number of vehicles of a record whose sums are exact, see `require_exact_sums`."""
 
 GROWTH = 1.5
 """Factor on the size of full tables."""
@@ -101,7 +98,7 @@ class Traffic:
         Records that are missing on disk are made, on all cores where there are several.
 
         Raises:
-            ValueError: A record is a measured field, and vehicles are read, or it has too many.
+            ValueError: A record is a measured field, and vehicles are read.
         """
         new = [index for index in np.unique(indices).tolist() if not self._loaded[index]]
         if len(new) > 1:
@@ -148,10 +145,6 @@ class Traffic:
     def _append(self, index: int, record: Record) -> None:
         """Append the vehicles of a record, with what each group sees of them."""
         record = record.vehicles_for("the release model, or the keyword penetration,")
-        require(
-            record.n_vehicles <= MOST_VEHICLES, f"the record of traffic seed {self.seeds[index]}",
-            f"of at most {MOST_VEHICLES} vehicles", record.n_vehicles,
-        )  # fmt: skip
         end = self._n_rows + record.n_rows
         if end > self._vehicle.size:
             size = max(end, int(GROWTH * self._vehicle.size))

@@ -26,7 +26,7 @@ from dptse_env.sb3.road_policy import MOST_NEIGHBOURS, RoadChannels, RoadPolicy,
 from dptse_env.spaces.actions import ACTION_ENCODINGS, MaskAction, PendingPicks
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import Action, AnyArray, BoolArray, FloatArray, Observation
-from dptse_env.utils.fields import integer, require_name
+from dptse_env.utils.fields import integer, require_name, shown
 from dptse_env.utils.files import require_arrays, write_tensors
 from dptse_env.utils.registry import needed_for, require_registered
 from dptse_env.versions import versions_with
@@ -641,4 +641,4 @@ def _check_names(arguments: Mapping[str, Any], expected: Sequence[str]) -> None:
 def _check_size(wanted: int, n_values: int) -> None:
     """Refuse a network of more weights than a file has, before it takes memory."""
     if wanted > n_values:
-        raise ValueError(f"policy.arguments describe {wanted:.3g} weights, it has {n_values}")
+        raise ValueError(f"policy.arguments describe {shown(wanted)} weights, it has {n_values}")

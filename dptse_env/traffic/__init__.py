@@ -16,7 +16,7 @@ from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
 from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.traffic.penetration import Penetration
-from dptse_env.traffic.record import InvalidRecordError, Record, average_dwell
+from dptse_env.traffic.record import MOST_VEHICLES, InvalidRecordError, Record, average_dwell
 from dptse_env.traffic.recording import simulate_in_worker
 from dptse_env.traffic.roads import (
     CORRIDORS,
@@ -37,6 +37,7 @@ from dptse_env.traffic.sumo_input import NetworkError
 __all__ = [
     "CORRIDORS",
     "MAINLINE",
+    "MOST_VEHICLES",
     "PAPER_HIGHWAY",
     "SHORT_HIGHWAY",
     "Corridor",

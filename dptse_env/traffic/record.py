@@ -23,6 +23,9 @@ RECORD_FORMAT = "dptse-record"
 RECORD_VERSION = 2
 """Version of the format, raised when content or layout change: older records are made again."""
 
+MOST_VEHICLES = 2**20
+"""Largest number of vehicles of a record, of which sums are exact and ledgers fit into memory."""
+
 LARGEST_RECORD = 2**30
 """Largest size of a stored record [bytes]: 75 million rows."""
 
@@ -47,7 +50,8 @@ class Record:
         n_steps: number of steps.
         n_columns: number of record columns, S + R.
         step: (rows,) int32, non-decreasing, in 0..n_steps-1.
-        vehicle: (rows,) int32, index of the vehicle in its scenario, at most once in a step.
+        vehicle: (rows,) int32, index of the vehicle in its scenario, in 0..`MOST_VEHICLES` - 1, at
+            most once in a step.
         segment: (rows,) int16, record column that the vehicle is on.
         speed: (rows,) float32, at least 0 [km/h].
         field: None for vehicles; or else (n_steps, n_columns, 2) float64, at least 0, the density
@@ -102,10 +106,10 @@ class Record:
         if len(back):
             pair = tuple(self.step[back[0] : back[0] + 2].tolist())
             raise ValueError(f"record.step must be non-decreasing, got {pair}")
-        for name, bound in (("step", self.n_steps), ("segment", self.n_columns)):
+        bounds = {"step": self.n_steps, "segment": self.n_columns, "vehicle": MOST_VEHICLES}
+        for name, bound in bounds.items():
             low, high = int(getattr(self, name).min()), int(getattr(self, name).max())
             require(low >= 0 and high < bound, f"record.{name}", f"in 0..{bound - 1}", (low, high))
-        require(int(self.vehicle.min()) >= 0, "record.vehicle", ">= 0", int(self.vehicle.min()))
         sound = bool(np.isfinite(self.speed).all() and self.speed.min() >= 0.0)
         require(sound, "record.speed", "finite and >= 0", float(self.speed.min()))
         # Privacy relies on this: a vehicle is on one segment at a step and counts there once.

@@ -14,7 +14,16 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from dptse_env.release import noise as module
-from dptse_env.release.noise import BLOCK, DOUBT, FAR, Noise, grid_of, normal_of, rounded_normal
+from dptse_env.release.noise import (
+    BLOCK,
+    DOUBT,
+    FAR,
+    LARGEST_SIGMA,
+    Noise,
+    grid_of,
+    normal_of,
+    rounded_normal,
+)
 
 from .worlds import ONE, residual_faults, streams
 
@@ -269,11 +278,11 @@ def test_an_episode_has_its_own_stream_in_any_batch_and_interleaving(data, n_epi
 
 def test_nothing_is_released_before_the_first_reset():
     noise = Noise(3, S)
-    with pytest.raises(RuntimeError, match="^episode 0 must be reset before it is released: it "):
+    with pytest.raises(RuntimeError, match=r"^episode 0 must be reset before it is released: it "):
         drawn(noise, 1)
     noise.reset(np.array([0, 2]), streams(1, 2))
     drawn(noise, 70, [0, 2])
-    with pytest.raises(RuntimeError, match="^episode 1 must be reset before it is released: it "):
+    with pytest.raises(RuntimeError, match=r"^episode 1 must be reset before it is released: it "):
         drawn(noise, 1, [1])
     with pytest.raises(ValueError, match="shorter"):
         noise.reset(np.arange(2), streams(1))
@@ -316,6 +325,18 @@ def test_releases_lie_on_a_public_grid_much_finer_than_the_noise(sigma):
     steps = added(started(1), values, sigma=sigma) / grid
     np.testing.assert_array_equal(steps, np.rint(steps))
     assert (steps % 2.0 == 1.0).any()
+
+
+def test_the_widest_noise_is_exact_and_wider_one_is_refused():
+    values, widest = np.full((1, S, 2), 300.0), np.full((1, S, 2), LARGEST_SIGMA)
+    steps = [rounded_normal(LARGEST_SIGMA, int(bits), lambda: 0) for bits in (2, 2**64 - 1)]
+    assert all(float(300 + step) == 300 + step for step in steps)
+    assert np.ptp(added(started(1), values, sigma=widest)) > LARGEST_SIGMA
+    for bad in (2.0 * LARGEST_SIGMA, 1e150, np.inf, np.nan, 0.0):
+        sigma = widest.copy()
+        sigma[0, 3, 1] = bad
+        with pytest.raises(ValueError, match=r"^privacy\.epsilon must be such that noise has "):
+            added(started(1), values, sigma=sigma)
 
 
 def fine_bits(densities):

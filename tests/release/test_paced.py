@@ -18,7 +18,8 @@ from dptse_env.config import resolve
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import Paced, PacedSettings, Pacing
-from dptse_env.release.noise import Noise
+from dptse_env.release.noise import LARGEST_SIGMA, Noise
+from dptse_env.release.pacing import LEAST_PRICE
 from tests.helpers import AWAY, record
 
 from .worlds import (
@@ -154,6 +155,13 @@ def test_without_a_finite_prediction_centres_fall_back_and_releases_go_on(bad, q
     assert [*told, release.public(ONE)["centre_fallback"][0]] == [0.0, 1.0, 0.0, 1.0, 0.0]
 
 
+def test_a_fall_back_is_told_of_its_own_episode():
+    speed = np.array([[np.nan], [40.0]])
+    two = started(Worlds(crowd(), crowd()))
+    two.release(request(1, prediction=predicting(20.0, speed, 2), episodes=BOTH))
+    assert two.public(BOTH)["centre_fallback"].tolist() == [1.0, 0.0]
+
+
 def test_another_pacing_sets_the_prices_and_bad_ones_are_refused():
     class Other(Pacing):
         def prices(self, episodes, observed, density, speed):
@@ -163,8 +171,22 @@ def test_another_pacing_sets_the_prices_and_bad_ones_are_refused():
     answer = np.full((1, COLUMNS), 0.04)
     assert release.release(request(1)).sigma[0, 0, 0] == pytest.approx(5.0 / LENGTH)
     answer = answer - 1.0
-    with pytest.raises(ValueError, match=r"^privacy\.pacing must return .*positive"):
+    with pytest.raises(ValueError, match=r"^privacy\.pacing must return finite"):
         release.release(request(1))
+
+
+@pytest.mark.parametrize("ratio", [0.01, 1.0])
+def test_the_least_prices_have_noise_that_is_exact(ratio):
+    release = started(ratio=ratio, clip=200.0)
+    least = np.full((1, COLUMNS), LEAST_PRICE)
+    release.pacing.prices = lambda *args: least
+    assert 2**38 <= release.release(request(1)).sigma.max() * LENGTH <= LARGEST_SIGMA
+
+
+def test_a_report_above_the_limit_counts_as_the_limit():
+    release = started(Worlds(stays(0, 1.3 * LIMIT)))
+    sums, _ = next(collected(release, Public.constant(release, 0.01, LIMIT - 5.0)))
+    assert sums[0, 0].tolist() == [1.0, 5.0]
 
 
 def test_expected_deviations_are_those_of_free_traffic():

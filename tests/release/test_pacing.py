@@ -7,7 +7,7 @@ import pytest
 
 from dptse_env.model.network import make_layout
 from dptse_env.release import PACINGS, Group, Paced, PacedSettings, QueryOptions, Task
-from dptse_env.release.pacing import EventPacing, TracerPacing, check_prices
+from dptse_env.release.pacing import LEAST_PRICE, EventPacing, TracerPacing, check_prices
 from dptse_env.traffic import SHORT_HIGHWAY
 from tests.helpers import UNEVEN
 
@@ -238,12 +238,12 @@ def test_single_queries_of_a_second_have_the_whole_of_their_group_s():
 def test_good_prices_pass_and_bad_ones_are_named():
     good = np.array([[0.5, 1.0]])
     assert check_prices(good, (1, 2)) is good
-    assert check_prices([[0.5, 1.0]], (1, 2)).tolist() == [[0.5, 1.0]]
+    assert check_prices([[LEAST_PRICE, 1.0]], (1, 2)).tolist() == [[LEAST_PRICE, 1.0]]
     for bad in (good[0], good.astype(int), None, "high"):
         with pytest.raises(ValueError, match=r"^privacy\.pacing must return floats of shape"):
             check_prices(bad, (1, 2))
-    for value in (0.0, -0.1, np.nan, np.inf):
-        with pytest.raises(ValueError, match=r"^privacy\.pacing must return prices that are pos"):
+    for value in (0.0, -0.1, np.nan, np.inf, 0.9 * LEAST_PRICE):
+        with pytest.raises(ValueError, match=r"^privacy\.pacing must return finite prices >= 1"):
             check_prices(np.array([[0.5, value]]), (1, 2))
 
 

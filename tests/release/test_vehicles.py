@@ -73,13 +73,6 @@ def test_missing_records_are_made_together_and_loaded_once(monkeypatch):
     assert ensured == [[7, 9]]
 
 
-def test_a_record_of_more_vehicles_than_sums_can_hold_is_refused(monkeypatch):
-    monkeypatch.setattr("dptse_env.release.vehicles.MOST_VEHICLES", 29)
-    Worlds(crowd(29)).release(PacedSettings())
-    with pytest.raises(ValueError, match=r"^the record of traffic seed 0 must be of at most 29 "):
-        Worlds(crowd(30)).release(PacedSettings())
-
-
 # --- ledgers ----------------------------------------------------------------------------------
 
 
