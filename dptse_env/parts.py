@@ -183,17 +183,19 @@ def privacy_report(config: EnvConfig) -> PrivacyReport:
 def complete_report(
     config: EnvConfig, release: ReleaseModel, boundary: BoundaryModel | type[BoundaryModel]
 ) -> PrivacyReport:
-    """Return a release model's report, voided where anything else shows the true traffic."""
+    """Return a release model's report, voided where anything else depends on the traffic."""
     shown = ("truth_in_info",) if config.truth_in_info else ()
-    return release.report().voided((*boundary.void_reasons, *shown))
+    measured = ("measured_values",) if config.corridor.measured else ()
+    return release.report().voided((*boundary.void_reasons, *measured, *shown))
 
 
 def warn_where_void(config: EnvConfig) -> None:
     """Warn where a release model that gives a guarantee was asked for, and other fields void it."""
     if not RELEASE_MODELS.find(config.privacy.preset).claims_guarantee:
         return
-    # Who asks for the truth in info knows that it is shown.
-    reasons = set(privacy_report(config).void_reasons) - {"truth_in_info"}
+    # Who asks for the truth in info knows that it is shown. Imported and fitted roads are for
+    # experiments on their own traffic.
+    reasons = set(privacy_report(config).void_reasons) - {"truth_in_info", "measured_values"}
     if reasons:
         # A release model of another package may have reasons of its own, which explain themselves.
         listed = "; ".join(

@@ -85,7 +85,7 @@ class Road:
     def identity(self, tries: int) -> dict[str, Any]:
         """Return what two fits must share for one to go on with what the other has found."""
         road = dataclasses.asdict(self.corridor)
-        del road["average_dwell"]  # the fit itself puts it into the file
+        del road["average_dwell"], road["measured"]  # the fit itself puts them into the file
         content = {
             "road": road,
             "env": self.env,
@@ -116,10 +116,10 @@ class Road:
         """Write down what is fitted, and the road that is played, with the dwell that it has."""
         stages.mkdir(parents=True, exist_ok=True)
         write_json(stages / BEGUN, self.identity(tries))
+        # The file that a fit leaves has more under `measured`, and is the same road.
+        played = dataclasses.replace(self.corridor, measured=())
         if "average_dwell" in self.assumed:
-            played = dataclasses.replace(self.corridor, average_dwell=dwell)
-        else:
-            played = self.corridor
+            played = dataclasses.replace(played, average_dwell=dwell)
         write_corridor(stages / PLAYED, played)
 
     def measure_dwell(self, library: RecordLibrary) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import os
 import tomllib
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ import tomlkit
 from agents.fitting.road import CHOSEN
 from dptse_env.utils.files import write_atomically
 
-TABLE, DWELL = "environment", "average_dwell"
+TABLE, DWELL, MEASURED = "environment", "average_dwell", "measured"
 
 
 def copy_of(path: Path) -> Path:
@@ -33,7 +34,8 @@ def write_choice(path: Path, keywords: Mapping[str, Any], dwell: float | None) -
     """Put keywords into the table of a road file, and keep a copy of the file as it was.
 
     Comments, order and all other values stay. Of the keywords that a fit decides, those that are
-    not given go.
+    not given go. The names of what is written stand under ``measured``, since it depends on the
+    records.
 
     Args:
         path: The road file.
@@ -48,8 +50,10 @@ def write_choice(path: Path, keywords: Mapping[str, Any], dwell: float | None) -
         ValueError: The table cannot be changed where it stands; the message has what to add.
     """
     text = path.read_bytes().decode("utf-8")
-    new = _changed(text, keywords, dwell)
     expected = tomllib.loads(text)
+    measured = [*expected.get(MEASURED, ()), *([] if dwell is None else [DWELL]), *keywords]
+    expected[MEASURED] = list(dict.fromkeys(measured))
+    new = _changed(text, keywords, dwell, expected[MEASURED])
     table = {k: v for k, v in expected.get(TABLE, {}).items() if k not in CHOSEN}
     expected[TABLE] = {**table, **keywords}
     if dwell is not None:
@@ -64,8 +68,13 @@ def write_choice(path: Path, keywords: Mapping[str, Any], dwell: float | None) -
     return True
 
 
-def _changed(text: str, keywords: Mapping[str, Any], dwell: float | None) -> str:
+def _changed(
+    text: str, keywords: Mapping[str, Any], dwell: float | None, measured: list[str]
+) -> str:
     document = tomlkit.parse(text)
+    is_new = MEASURED not in document
+    if not is_new and document[MEASURED] != measured:
+        document[MEASURED] = measured
     table: Any = document.setdefault(TABLE, tomlkit.table())
     for key in CHOSEN:
         if key not in keywords:
@@ -73,12 +82,11 @@ def _changed(text: str, keywords: Mapping[str, Any], dwell: float | None) -> str
     for key, value in keywords.items():
         if table.get(key) != value:
             table[key] = copy.copy(value)
-    new = tomlkit.dumps(document)
-    if dwell is None:
-        return new
     # Ahead of the first entry is always the top level, which tables end.
-    lines = new.splitlines(keepends=True)
+    lines = tomlkit.dumps(document).splitlines(keepends=True)
     first = next(k for k, line in enumerate(lines) if line.strip() and line.lstrip()[0] != "#")
     end = "\r\n" if lines[first].endswith("\r\n") else "\n"
-    measured = f"{DWELL} = {dwell:g}  # measured by dptse fit [s]{end}"
-    return "".join([*lines[:first], measured, *lines[first:]])
+    added = [] if dwell is None else [f"{DWELL} = {dwell:g}  # measured by dptse fit [s]{end}"]
+    if is_new:
+        added.append(f"{MEASURED} = {json.dumps(measured)}  # on the records of this road{end}")
+    return "".join([*lines[:first], *added, *lines[first:]])

@@ -362,6 +362,7 @@ def import_field(
         bare,
         demand=Demand(mainline=((0.0, round(float(entering), 1)),)),
         average_dwell=round(average_dwell(bare, records[:n_training]), 3),
+        measured=("demand", "average_dwell"),
     )
     sources: list[dict[str, Any]] = [
         {"seed": seed, "file": source.density.name, "start": start}

@@ -203,6 +203,7 @@ def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corr
         ),
         exit_shares=tuple(round(float(each), 4) for each in held),
         average_dwell=round(average_dwell(corridor, records()), 3),
+        measured=("demand", "exit_shares", "average_dwell"),
     )
 
 

@@ -33,6 +33,11 @@ VOID_REASONS: Mapping[str, str] = MappingProxyType(
         "releases_not_composed": (
             "density and speed together reveal more than the configured epsilon"
         ),
+        "measured_values": (
+            "corridor.measured names values that were measured on the records that are released, "
+            "and so depend on each vehicle in them: take them from other traffic, such as that of "
+            "another day, and empty it"
+        ),
         "truth_in_info": "info['truth'] shows the true traffic and what each vehicle contributed",
     }
 )

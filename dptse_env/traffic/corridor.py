@@ -32,7 +32,9 @@ from dptse_env.utils.fields import Interval, checked_fields, from_mapping, integ
 
 T = TypeVar("T")
 
-NOT_TRAFFIC = ("name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell")
+NOT_TRAFFIC = (
+    "name", "fixed_sensors", "density_scale", "speed_scale", "average_dwell", "measured",
+)  # fmt: skip
 """Fields that describe the observation of the traffic and do not change the traffic itself."""
 
 GEOMETRY = (
@@ -119,6 +121,9 @@ class Corridor:
             alike.
         recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
             With recordings the demand is a description of them, and there is no incident.
+        measured: names of the fields above, and of keywords of an environment, whose values were
+            measured on the records of this road, as imports and ``dptse fit`` write down. They void
+            a guarantee for the vehicles of these records.
 
     Raises:
         ValueError: The geometry is impossible, or demand, incident or sensors do not fit it.
@@ -147,6 +152,7 @@ class Corridor:
     network: SumoScenario | None = None
     recordings: Recordings | None = None
     vehicle_classes: tuple[VehicleClass, ...] = ()
+    measured: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""

@@ -69,6 +69,8 @@ def test_the_file_has_the_choice_and_keeps_all_else(fitted):
     assert content["environment"]["estimator"] == found["estimator"]
     assert content["environment"]["bandwidth"] == 1
     assert 3.0 < content["average_dwell"] < 10.0
+    written = {"average_dwell", *content["environment"]} - {"bandwidth"}
+    assert set(content["measured"]) >= written
 
 
 def test_the_environment_has_the_set_of_the_file_by_its_name(fitted):
@@ -273,12 +275,16 @@ def test_a_choice_is_written_whatever_the_file_looks_like(text, tmp_path):
     assert copy_of(path).read_bytes() == text.encode()
     new, old = tomllib.loads(path.read_bytes().decode()), tomllib.loads(text)
     assert new.pop("average_dwell") == 9.8
+    assert new.pop("measured") == ["average_dwell", "parameters", "estimator"]
     table = old.pop("environment", {})
     table.pop("estimator_settings", None)
     assert new.pop("environment") == {**table, **chosen}
     assert new == old
     assert not write_choice(path, chosen, None)
     assert copy_of(path).read_bytes() == text.encode()
+    assert write_choice(path, {"estimator": "ukf", "estimator_settings": "x.json"}, None)
+    measured = tomllib.loads(path.read_bytes().decode())["measured"]
+    assert measured == ["average_dwell", "parameters", "estimator", "estimator_settings"]
 
 
 NO_DEMAND = ROAD.replace("2400", "0")

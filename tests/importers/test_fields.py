@@ -41,6 +41,7 @@ def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
     assert find_corridor(str(tmp_path / "road" / "road.toml")) == corridor
     assert corridor.segment_length == pytest.approx(0.1)
     assert corridor.density_scale == 444.0
+    assert corridor.measured == ("demand", "average_dwell")
     library = RecordLibrary(tmp_path / "cache")
     first, second = (library.get(corridor, seed) for seed in (0, 1))
     assert first.field.shape == (101, 5, 2)

@@ -18,6 +18,7 @@ def test_several_files_are_several_recordings(tmp_path):
     assert {name: len(each) for name, each in imported.seeds.items()} == {
         "training": 4, "validation": 1, "test": 1
     }  # fmt: skip
+    assert imported.corridor.measured == ("demand", "exit_shares", "average_dwell")
 
 
 def test_every_split_has_a_window_if_it_can():

@@ -44,9 +44,10 @@ def test_the_dict_is_its_own_json_and_fresh_each_time(preset, penetration):
         ({}, ()),
         ({"truth_in_info": True}, ("truth_in_info",)),
         ({"privacy": {"boundary_inputs": "true"}}, ("boundary_inputs",)),
+        ({"corridor": {"measured": ["demand"]}}, ("measured_values",)),
     ],
 )
-def test_truth_in_info_and_true_boundary_inputs_void_a_guarantee(keywords, reasons):
+def test_whatever_else_depends_on_the_traffic_voids_a_guarantee(keywords, reasons):
     found = privacy_report(resolve("private-highway", keywords))
     assert found.void_reasons == reasons
     assert (found.guarantee == "none") == bool(reasons)

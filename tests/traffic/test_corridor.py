@@ -82,6 +82,7 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
         "density_scale": 1.0,
         "speed_scale": 1.0,
         "average_dwell": 1.0,
+        "measured": ("demand",),
     }
     names = {field.name for field in dataclasses.fields(PAPER_HIGHWAY)}
     assert names == {"recordings", *changes, *observed}, (

@@ -102,6 +102,7 @@ def import_road(
         demand=_demand(draft, first),
         exit_shares=_exit_shares(draft, first),
         average_dwell=round(average_dwell(draft, [record]), 2),
+        measured=("demand", "exit_shares", "average_dwell"),
     )
     remarks = layout.remarks
     inside = (first.argmin(axis=1) < draft.n_mainline) & (first.min(axis=1) > 0)

@@ -156,6 +156,7 @@ def test_demand_exit_shares_and_dwell_are_counted(road):
     # At the off-ramp: 300 of 1500 + 300 + 400 an hour.
     assert corridor.exit_shares[0] == pytest.approx(300 / 2200, rel=0.3)
     assert 3.0 < corridor.average_dwell < 6.0
+    assert corridor.measured == ("demand", "exit_shares", "average_dwell")
     assert road.remarks == ()
 
 
