@@ -1,24 +1,28 @@
 """SUMO files of one's own: what a road is recorded from in place of a network made for it.
 
-The network, its internal links, routes, vehicle types and options are those of the files. Three
-things differ from ``sumo -c``: the seed is that of the traffic seed, the demand may be scaled, and
-nothing is written: output options are refused, and what additional files would write goes nowhere.
+The network, its internal links, routes, vehicle types and options are those of the files. Four
+things differ from ``sumo -c``: the seed is that of the traffic seed, the demand may be scaled,
+vehicles are in order of departure, and nothing is written. SUMO gets copies of the files that name
+no file, and those options alone that change the traffic, in an empty folder.
 """
 
 import gzip
 import re
+import zlib
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
+from math import inf
 from operator import itemgetter
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated
+from typing import Annotated, Any
 from xml.etree import ElementTree
 
 from dptse_env.traffic.demand import Incident, lowest_limit
-from dptse_env.utils.fields import Interval, checked_fields, require
+from dptse_env.utils.fields import Interval, checked_fields, require, shown
 from dptse_env.utils.files import file_digest
 
 Position = Annotated[float, Interval(0, 1e6)]
@@ -30,21 +34,26 @@ StepLength = Annotated[float, Interval(0.01, 1.0)]
 Clock = Annotated[int, Interval(0, 10_000_000)]
 """Whole seconds of SUMO's clock."""
 
-FORCED = frozenset([
-    "n", "r", "a", "c", "b", "e", "S", "net-file", "route-files", "additional-files",
-    "configuration-file", "begin", "end", "seed", "random", "scale", "step-length", "no-step-log",
-    "duration-log.disable", "no-warnings", "xml-validation", "xml-validation.net",
-    "xml-validation.routes",
-])  # fmt: skip
-"""Options of SUMO that a recording sets itself."""
-
-WRITES = re.compile(
-    r"output|statistic|(^|[.-])log([.-]|$)|^save-state|^(summary|tripinfo|vehroutes?|netstate|ndump)$"
+TRAFFIC = re.compile(
+    r"(intermodal-)?collision\..+|default\..+|emergencydecel\..+|extrapolate-departpos|ignore-.+"
+    r"|insertion-checks|junction-taz|keep-after-arrival|lanechange\..+|lateral-resolution"
+    r"|mapmatch\..+|max-(depart-delay|num-.+)|no-internal-links|overhead-wire\..+|parking\..+"
+    r"|pedestrian\.(model|timegap-crossing|striping\..+|jupedsim\.(?!wkt|py).+)|persontrip\..+"
+    r"|railsignal([.]|-moving-).+|railway\..+|random-depart-offset|replay-rerouting|ride\..+"
+    r"|route-steps|routing-algorithm|scale-suffix|slope-centered|(sloppy|eager|emergency)-insert"
+    r"|startup-wait-threshold|step-method\.ballistic|thread-rngs|time-to-(impatience|teleport).*"
+    r"|tls\..+|use-stop-.+|waiting-time-memory|weight-attribute|weights\..+"
+    r"|(person-)?device\.(battery|bluelight|driverstate|elechybrid|friction|glosa|rerouting"
+    r"|stationfinder|taxi|toc)\.(?!(.+\.)?(file|output)$).+"
 )
-"""Options of SUMO that write files, which a recording does not."""
+"""Options of SUMO that change the traffic and name no file. All others write, measure or show
+something, read a file that no digest covers, or are set by a recording."""
 
-READ_BY = frozenset(["rerouter", "variableSpeedSign", "vss", "include"])
-"""Elements of routes and additional files whose ``file`` is read; of all others it is written."""
+READ_BY = frozenset(["rerouter", "variableSpeedSign", "vss", "calibrator", "include"])
+"""Elements whose ``file`` or ``href`` is read; of all others it is written."""
+
+UNREADABLE = (SyntaxError, LookupError, ValueError, EOFError, zlib.error, gzip.BadGzipFile)
+"""Errors of reading a file that is no XML, or is cut or damaged."""
 
 TOLERANCE = 0.01
 """Precision of lengths in network files [m]."""
@@ -53,7 +62,15 @@ KMH = 3.6
 """Factor from m/s to km/h."""
 
 _PATH = "corridor.network"
-_WRITTEN = ("file", "output", "dest")
+_FILE = re.compile(r"(^|[._-])(files?|output|dest|href)$|File$|Output$")
+"""Attributes, and keys of parameters, that name files."""
+_ELSEWHERE = re.compile(r"\s*([/\\~]|[A-Za-z]:[/\\])|(.*[/\\])?\.\.([/\\]|$)|.*(\$|://)")
+"""Values of parameters that name a place outside of the folder that SUMO runs in."""
+_DEPARTURES = {
+    **dict.fromkeys(("vehicle", "trip", "person", "container"), "depart"),
+    **dict.fromkeys(("flow", "personFlow", "containerFlow"), "begin"),
+}
+"""Attribute with the departure, by element."""
 
 
 class ChangedFilesError(ValueError):
@@ -72,14 +89,14 @@ class SumoScenario:
         sha256: SHA-256 (hex) of each file: the network, the route files, the additional files.
         folder: folder of the files; in a road file it may be relative to that file. Their names are
             relative to it.
-        additional: additional files, in SUMO's order. What they would write is not written.
+        additional: additional files, in SUMO's order.
         begin: second of SUMO's clock at which a record starts.
         warm_up: seconds simulated before that, which are not recorded.
         step_length: SUMO's time step [s]; it divides a second.
-        options: further options of SUMO, ``--name=value`` each.
+        options: further options of SUMO, ``--name=value`` each, that change the traffic.
 
     Raises:
-        ValueError: Stretches are empty or overlap, or an option is one that a recording sets.
+        ValueError: Stretches are empty or overlap, or an option is none of `TRAFFIC`.
     """
 
     net: str
@@ -116,13 +133,8 @@ class SumoScenario:
             match = re.fullmatch(r"--([a-z][\w.-]*)(=.*)?", option)
             require(match is not None, f"{_PATH}.options", "--name=value each", option)
             assert match is not None
-            free = match[1] not in FORCED and not WRITES.search(match[1])
-            require(
-                free,
-                f"{_PATH}.options",
-                "free of outputs and of what a recording sets",
-                option,
-            )
+            allowed = "options that change the traffic: no outputs, and none that a recording sets"
+            require(TRAFFIC.fullmatch(match[1]) is not None, f"{_PATH}.options", allowed, option)
 
     def _check_columns(self) -> None:
         taken: dict[str, list[tuple[float, float]]] = {}
@@ -220,31 +232,27 @@ class Places:
 
 
 def command(folder: Path, network: SumoScenario, seed: int, scale: float) -> list[str]:
-    """Return SUMO's command line.
+    """Return SUMO's command line, whose names of files are relative to a folder, and plain ASCII.
 
     Args:
-        folder: an empty folder, for copies of additional files.
+        folder: an empty folder, for copies of the files, in which SUMO has to run.
         network: the files, which are checked against their digests.
         seed: SUMO's seed.
         scale: factor on the demand [-].
 
     Raises:
         ChangedFilesError: A file is missing or has changed.
-        ValueError: An additional file is no XML.
+        ValueError: A file is no XML, or reads another file.
     """
     network.check_files()
-    files = ["-n", str(network.path(network.net))]
-    if network.routes:
-        files += ["-r", ",".join(str(network.path(name)) for name in network.routes)]
-    if network.additional:
-        copies = [
-            _without_outputs(network.path(name), folder / f"additional-{i}.xml")
-            for i, name in enumerate(network.additional)
-        ]
-        files += ["-a", ",".join(map(str, copies))]
+    begin, words = network.begin - network.warm_up, ["sumo"]
+    for option, names in (("n", (network.net,)), ("r", network.routes), ("a", network.additional)):
+        copies = [f"{option}{i}.xml" for i in range(len(names))]
+        for name, copy in zip(names, copies, strict=True):
+            copy_input(network.path(name), folder / copy, begin)
+        words += [f"-{option}", ",".join(copies)] if copies else []
     return [
-        *("sumo", *files, "--seed", str(seed), "--scale", f"{scale:.6g}"),
-        *("--begin", str(network.begin - network.warm_up)),
+        *(*words, "--seed", str(seed), "--scale", f"{scale:.6g}", "--begin", str(begin)),
         *("--step-length", f"{network.step_length:g}", *network.options),
     ]
 
@@ -329,18 +337,128 @@ class VehicleLimits:
                 vehicle.setMaxSpeed(name, usual)
 
 
-def _without_outputs(path: Path, copy: Path) -> Path:
-    """Copy an additional file so that what it would write goes nowhere; return the copy."""
-    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-        try:
-            tree = ElementTree.parse(file)
-        except ElementTree.ParseError as error:
-            raise ValueError(f"{path}: must be XML: {error}") from error
-    for element in tree.iter():
-        for name in _WRITTEN:
-            if name in element.attrib and element.tag not in READ_BY:
+@dataclass
+class Copied:
+    """What a copy for SUMO differs in from its file.
+
+    Attributes:
+        n_elements: number of elements at the top.
+        is_sorted: whether vehicles were in order of departure before.
+        outputs: number of outputs that were taken out, by what writes them.
+        reads: elements that read another file, for people.
+    """
+
+    n_elements: int = 0
+    is_sorted: bool = True
+    outputs: Counter[str] = field(default_factory=Counter)
+    reads: list[str] = field(default_factory=list)
+
+
+def copy_input(path: Path, copy: Path, begin: float) -> Copied:
+    """Copy a network, routes or additional elements so that SUMO writes nothing and loses nobody.
+
+    No element of the copy names a file. Vehicles are in order of departure: in a file of routes
+    SUMO drops vehicles, and starts flows late, that stand behind later ones.
+
+    Args:
+        path: the file, plain or gzipped.
+        copy: where the copy goes.
+        begin: second of SUMO's clock at which flows begin that do not say when.
+
+    Raises:
+        ValueError: It is no XML, or reads another file.
+    """
+    # What moves, by its departure or, where an event starts it, that of what stands before it. In
+    # a file out of order what is defined comes before all of them.
+    parts: list[tuple[float, str]] = []
+    found, last, depth = Copied(), -inf, 0
+    try:
+        with open_xml(path) as file:
+            for event, element in ElementTree.iterparse(file, events=("start", "end")):
+                depth += 1 if event == "start" else -1
+                if event == "start" and depth == 1:
+                    root, head = element, ElementTree.Element(element.tag, dict(element.attrib))
+                elif event == "end" and depth == 1:
+                    found.n_elements += 1
+                    is_left = _without_files(element, found)
+                    moves = element.tag in _DEPARTURES
+                    departure = _departure(element, begin) if moves else None
+                    if departure is not None:
+                        found.is_sorted &= departure >= last
+                        last = departure
+                    if is_left:
+                        text = ElementTree.tostring(element, encoding="unicode").strip()
+                        parts.append((last if moves else -inf, text))
+                    root.clear()
+    except UNREADABLE as error:
+        raise ValueError(f"{path} must be XML: {error!s:.200}") from error
+    _without_files(head, found)
+    if found.reads:
+        raise ValueError(f"{path}: {found.reads[0]}")
+    if not found.is_sorted:
+        parts.sort(key=itemgetter(0))
+    head.text = "\n"
+    start, _, end = ElementTree.tostring(head, encoding="unicode").rpartition("</")
+    with copy.open("w", encoding="utf-8") as written:
+        written.write(start)
+        written.writelines(f"{text}\n" for _, text in parts)
+        written.write(f"</{end}\n")
+    return found
+
+
+def _without_files(element: ElementTree.Element, found: Copied) -> bool:
+    """Take what names files out of an element; return whether anything is left of it."""
+    element.tag = tag = element.tag.rpartition("}")[2]
+    if tag == "param":
+        key = element.get("key", "")
+        if _FILE.search(key) or _ELSEWHERE.match(element.get("value", "")):
+            found.outputs[key] += 1
+            return False
+    for name, value in list(element.attrib.items()):
+        if not (name.startswith("{") or _FILE.search(name)):
+            continue
+        del element.attrib[name]
+        if tag in READ_BY and name in ("file", "href"):
+            found.reads.append(
+                f"<{tag}> must not read another file, got {shown(value)}: put its content in its "
+                "place"
+            )
+        elif name in ("file", "dest", "output"):
+            found.outputs[tag] += 1
+            if name != "output":  # SUMO asks for the others
                 element.set(name, "NUL")
-            elif name in element.attrib:
-                element.set(name, str((path.parent / element.attrib[name]).absolute()))
-    tree.write(copy)
-    return copy
+    for child in list(element):
+        if not _without_files(child, found):
+            element.remove(child)
+    return True
+
+
+def _departure(element: ElementTree.Element, begin: float) -> float | None:
+    """Return when a vehicle, a person or a flow departs [s]; None if an event starts it."""
+    given = element.get(_DEPARTURES[element.tag])
+    if given is None:
+        return begin
+    try:
+        return clock(given)
+    except ValueError:
+        return None
+
+
+def clock(text: str) -> float:
+    """Return a time of SUMO in seconds: a number, or ``[days:]hours:minutes:seconds``.
+
+    Raises:
+        ValueError: It is neither.
+    """
+    *parts, rest = (float(part) for part in text.split(":"))
+    weights: dict[int, tuple[float, ...]] = {0: (), 2: (3600.0, 60.0), 3: (86400.0, 3600.0, 60.0)}
+    if len(parts) not in weights:
+        raise ValueError(f"must be seconds or hh:mm:ss, got {shown(text)}")
+    return sum(w * part for w, part in zip(weights[len(parts)], parts, strict=True)) + rest
+
+
+def open_xml(path: Path) -> Any:
+    """Open a file, plain or gzipped, for reading bytes."""
+    with path.open("rb") as file:
+        zipped = file.read(2) == b"\x1f\x8b"
+    return gzip.open(path) if zipped else path.open("rb")

@@ -95,7 +95,8 @@ def sumo_version() -> str:
 def simulate(corridor: Corridor, seed: int) -> Record:
     """Simulate one scenario in this process and record it.
 
-    The same corridor and seed give the same record, bit for bit, in any process.
+    The same corridor and seed give the same record, bit for bit, in any process. Meanwhile the
+    process's current folder is a temporary one, so that SUMO writes nothing elsewhere.
 
     Raises:
         RecordingError: SUMO fails, the corridor's own files are missing or changed, or libsumo
@@ -121,6 +122,8 @@ def simulate(corridor: Corridor, seed: int) -> Record:
 def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
     """Load a scenario into SUMO, at second 0, and close it afterwards.
 
+    In the body the current folder is an empty one, where SUMO runs.
+
     Errors are those of `simulate`; a failure of SUMO in the body is one of them.
 
     Yields:
@@ -137,18 +140,23 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
             raise RecordingError.from_cause(corridor, scenario.seed, cause)
         folder = Path(directory)
         messages = folder / "messages.txt"
+        messages.touch()
         try:
-            with _stderr_to(messages):
-                libsumo.start([*_command(folder, network, corridor, scenario), *QUIET])
-            yield libsumo
+            command = [*_command(folder, network, corridor, scenario), *QUIET]
+            # Names in the folder are plain ASCII: SUMO opens no others where the locale is C.
+            with contextlib.chdir(folder):
+                try:
+                    with _stderr_to(messages):
+                        libsumo.start(command)
+                    yield libsumo
+                finally:
+                    if libsumo.isLoaded():
+                        libsumo.close()
         except Exception as error:
             output = messages.read_text(encoding="utf-8", errors="replace").strip()
             output = output[-LONGEST_OUTPUT:]
             cause = f"{type(error).__name__}: {error}" + (f"\n{output}" if output else "")
             raise RecordingError.from_cause(corridor, scenario.seed, cause) from error
-        finally:
-            if libsumo.isLoaded():
-                libsumo.close()
 
 
 def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iterator[int]:
@@ -249,7 +257,7 @@ def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario)
     network_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
     network_file.write_text(network, encoding="utf-8")
     route_file.write_text(routes_xml(corridor, scenario), encoding="utf-8")
-    files = ["-n", str(network_file), "-r", str(route_file)]
+    files = ["-n", network_file.name, "-r", route_file.name]
     return ["sumo", *files, "--seed", str(scenario.sumo_seed), *OPTIONS]
 
 

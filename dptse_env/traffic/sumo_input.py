@@ -127,10 +127,10 @@ def compile_network(geometry: Geometry) -> str:
         ):
             path = folder / f"corridor.{suffix}.xml"
             path.write_text(text, encoding="utf-8")
-            command += [option, str(path)]
+            command += [option, path.name]
         output = folder / "corridor.net.xml"
         result = subprocess.run(
-            [*command, "-o", str(output)], capture_output=True, text=True, check=False
+            [*command, "-o", output.name], cwd=folder, capture_output=True, text=True, check=False
         )
         if result.returncode != 0:
             said = result.stderr.strip()[:LONGEST_OUTPUT]

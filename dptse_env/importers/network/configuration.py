@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from dptse_env.importers.network.net import UNREADABLE, open_xml, root_of
-from dptse_env.traffic.own_sumo import FORCED, READ_BY, WRITES
+from dptse_env.importers.network.net import root_of
+from dptse_env.traffic.own_sumo import TRAFFIC, UNREADABLE, clock, copy_input, open_xml
 from dptse_env.utils.fields import shown
 
 SHORT = {
@@ -24,15 +24,9 @@ REFUSED = {
     "mesosim": "the mesoscopic model, which gives vehicles no positions",
     "load-state": "a saved state, which a digest does not cover",
     "weight-files": "travel times of edges, which a digest does not cover",
+    "device.fcd-replay.files": "positions of vehicles, which a digest does not cover",
 }
 """Options that cannot be kept, and what they stand for."""
-
-SHOWN = re.compile(
-    r"^(verbose|v|p|help|version|print-options|aggregate-warnings|step-log\..*|xml-validation.*"
-    r"|gui.*|window.*|delay|start|quit-on-end|breakpoints|game.*|registry.*"
-    r"|remote-port|num-clients|threads)$"
-)
-"""Options about what is shown, which are left out."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +39,8 @@ class Files:
         additional: additional files.
         begin: second of SUMO's clock at which it begins.
         step_length: SUMO's time step [s].
-        options: other options, ``--name=value`` each.
+        options: other options that change the traffic, ``--name=value`` each.
+        left_out: names of the options that a configuration has and a recording does not take.
     """
 
     net: Path
@@ -54,9 +49,16 @@ class Files:
     begin: float = 0.0
     step_length: float = 1.0
     options: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
-    def check(self) -> None:
+    def check(self, begin: float) -> tuple[str, ...]:
         """Check that route files and additional files are XML of their kinds.
+
+        Args:
+            begin: second of SUMO's clock at which it begins.
+
+        Returns:
+            What a recording leaves out or changes, for people.
 
         Raises:
             ValueError: There is none, one cannot be read or is empty, or it reads another file,
@@ -64,11 +66,28 @@ class Files:
         """
         if not self.routes and not self.additional:
             raise ValueError(f"routes: must have at least one file for {self.net}, got none")
-        for path in self.routes:
-            if _n_elements(path, "routes") <= 1:
+        remarks = [f"options that are not taken: {', '.join(self.left_out)}"] * bool(self.left_out)
+        kinds = {"net": (self.net,), "routes": self.routes, "additional": self.additional}
+        for where, path in ((where, path) for where, paths in kinds.items() for path in paths):
+            root = root_of(path, where)
+            if where != "net" and root.tag in ("net", "configuration", "sumoConfiguration"):
+                raise ValueError(f"{where}: {path} must hold {where}, got <{root.tag}>")
+            try:
+                with tempfile.TemporaryDirectory(prefix="dptse-import-") as folder:
+                    copied = copy_input(path, Path(folder) / "copy.xml", begin)
+            except ValueError as error:
+                raise ValueError(f"{where}: {error}") from error
+            if where == "routes" and not copied.n_elements:
                 raise ValueError(f"routes: {path} must have vehicles, got an empty file")
-        for path in self.additional:
-            _n_elements(path, "additional")
+            if not copied.is_sorted:
+                remarks.append(
+                    f"{path.name}: out of order of departure, where SUMO alone starts vehicles "
+                    "late or not at all; they are sorted"
+                )
+            if copied.outputs:
+                said = ", ".join(f"{n} of {name}" for name, n in copied.outputs.items())
+                remarks.append(f"{path.name}: outputs that are not written: {said}")
+        return tuple(remarks)
 
     @property
     def internal_links(self) -> bool:
@@ -87,8 +106,13 @@ def read_configuration(path: Path) -> Files:
     root = root_of(path, "configuration")
     if "onfiguration" not in root.tag:
         raise ValueError(f"{where} must be a <configuration> of SUMO, got <{root.tag:.60}>")
+    try:
+        with open_xml(path) as file:
+            elements = list(ElementTree.parse(file).iter())
+    except UNREADABLE as error:
+        raise ValueError(f"{where} must be XML: {error!s:.200}") from error
     values: dict[str, str] = {}
-    for element in _elements(path, "configuration"):
+    for element in elements:
         value = element.get("value", element.get("v"))
         if value is not None:
             values[SHORT.get(element.tag, element.tag)] = value
@@ -103,54 +127,24 @@ def read_configuration(path: Path) -> Files:
     files = {name: paths(name) for name in ("net-file", "route-files", "additional-files")}
     if len(files["net-file"]) != 1:
         raise ValueError(f"{where} must name one net-file, got {len(files['net-file'])}")
+    begin, step_length = (
+        _seconds(values.pop(name, default), f"{where}: {name}")
+        for name, default in (("begin", "0"), ("step-length", "1"))
+    )
+    kept = {name: value for name, value in values.items() if TRAFFIC.fullmatch(name)}
     return Files(
         net=files["net-file"][0],
         routes=files["route-files"],
         additional=files["additional-files"],
-        begin=_seconds(values.pop("begin", "0"), f"{where}: begin"),
-        step_length=_seconds(values.pop("step-length", "1"), f"{where}: step-length"),
-        options=tuple(f"--{name}={value}" for name, value in values.items() if _is_kept(name)),
+        begin=begin,
+        step_length=step_length,
+        options=tuple(f"--{name}={value}" for name, value in kept.items()),
+        left_out=tuple(name for name in values if name not in kept),
     )
 
 
 def _seconds(text: str, where: str) -> float:
-    """Return a time of SUMO in seconds: a number, or ``[days:]hours:minutes:seconds``."""
     try:
-        *clock, rest = (float(part) for part in text.split(":"))
-        weights = {0: (), 2: (3600.0, 60.0), 3: (86400.0, 3600.0, 60.0)}[len(clock)]
-    except (ValueError, KeyError) as error:
+        return clock(text)
+    except ValueError as error:
         raise ValueError(f"{where} must be seconds or hh:mm:ss, got {shown(text)}") from error
-    return sum(weight * part for weight, part in zip(weights, clock, strict=True)) + rest
-
-
-def _is_kept(option: str) -> bool:
-    """Return whether an option is about the traffic, and no recording sets it."""
-    return not (option in FORCED or WRITES.search(option) or SHOWN.search(option))
-
-
-def _n_elements(path: Path, where: str) -> int:
-    """Count the elements of a file of routes or additional elements; check what they are."""
-    root = root_of(path, where)
-    if root.tag in ("net", "configuration", "sumoConfiguration"):
-        raise ValueError(f"{where}: {path} must hold {where}, got <{root.tag}>")
-    count = 0
-    for element in _elements(path, where):
-        count += 1
-        read = element.get("file", element.get("href"))
-        if element.tag in READ_BY and read is not None:
-            raise ValueError(
-                f"{where}: {path}: <{element.tag}> must not read another file, got "
-                f"{shown(read)}: put its content in its place"
-            )
-        element.clear()  # route files may be large
-    return count
-
-
-def _elements(path: Path, where: str) -> Iterator[ElementTree.Element]:
-    """Yield the elements of a file, each as it begins."""
-    try:
-        with open_xml(path) as file:
-            for _, element in ElementTree.iterparse(file, events=("start",)):
-                yield element
-    except UNREADABLE as error:
-        raise ValueError(f"{where}: {path} must be XML: {error!s:.200}") from error

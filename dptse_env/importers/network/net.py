@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import gzip
-import zlib
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.sax import SAXException
 
+from dptse_env.traffic.own_sumo import UNREADABLE, open_xml
 from dptse_env.utils.fields import shown
 
 NEWEST_VERSION = (1, 20)
@@ -19,9 +18,6 @@ NEWEST_VERSION = (1, 20)
 
 VEHICLE_CLASS = "passenger"
 """Lanes that this class may not use (bus lanes, hard shoulders, pavements) do not count."""
-
-UNREADABLE = (SyntaxError, LookupError, ValueError, EOFError, zlib.error, gzip.BadGzipFile)
-"""Errors of reading a file that is no XML, or is cut or damaged."""
 
 # `sumolib` checks no element: one that is missing or of no use meets it as one of these.
 _BROKEN = (*UNREADABLE, OSError, SAXException, AttributeError, TypeError)
@@ -171,13 +167,6 @@ def predecessors(edge: Any) -> list[Any]:
 def n_lanes(edge: Any) -> int:
     """Return the number of an edge's lanes that are open to cars."""
     return sum(lane.allows(VEHICLE_CLASS) for lane in edge.getLanes())
-
-
-def open_xml(path: Path) -> Any:
-    """Open a file, plain or gzipped, for reading bytes."""
-    with path.open("rb") as file:
-        zipped = file.read(2) == b"\x1f\x8b"
-    return gzip.open(path) if zipped else path.open("rb")
 
 
 def root_of(path: Path, where: str) -> ElementTree.Element:

@@ -74,10 +74,10 @@ def import_road(
         ValueError: Files or fields are of no use, SUMO refuses the files, or no vehicle uses the
             path.
     """
-    files.check()
     if begin is None:
         require(float(files.begin).is_integer(), "begin", "whole seconds", files.begin)
         begin = int(files.begin) + warm_up
+    remarks = (*layout.remarks, *files.check(begin - warm_up))
     try:
         draft = _draft(files, layout, name, duration, begin, warm_up, speed_limit)
     except ValueError as problem:
@@ -104,7 +104,6 @@ def import_road(
         average_dwell=round(average_dwell(draft, [record]), 2),
         measured=("demand", "exit_shares", "average_dwell"),
     )
-    remarks = layout.remarks
     inside = (first.argmin(axis=1) < draft.n_mainline) & (first.min(axis=1) > 0)
     if inside.any():
         share = f"{inside.sum()} of {record.n_vehicles} vehicles"

@@ -27,6 +27,9 @@ CONFIGURATION = """
 </configuration>"""
 
 
+XI = 'xmlns:x="http://www.w3.org/2001/XInclude"'
+
+
 def read(folder, *change):
     path = folder / "town.sumocfg"
     path.write_text(CONFIGURATION.replace(*change) if change else CONFIGURATION)
@@ -42,7 +45,11 @@ def test_a_configuration_gives_files_and_options_of_the_traffic(tmp_path):
         begin=25200.0,
         step_length=0.5,
         options=("--time-to-teleport=300", "--no-internal-links=true", "--max-depart-delay=600"),
-    )
+        left_out=(
+            "fcd-output", "tripinfo", "end", "seed", "random", "verbose", "log", "no-step-log",
+            "gui-settings-file", "delay",
+        ),
+    )  # fmt: skip
     assert not files.internal_links
     assert read(tmp_path, "07:00:00", "1:00:00:10.5").begin == 86410.5
     assert read(tmp_path, "07:00:00", "12").begin == 12.0
@@ -61,6 +68,8 @@ def test_a_configuration_gives_files_and_options_of_the_traffic(tmp_path):
         ("routes <net><edge/></net>", " must hold routes, got <net>"),
         ('routes <routes><include href="b.xml"/></routes>', ": <include> must not read another"),
         ('additional <a><vss file="s.xml"/></a>', ": <vss> must not read another file, got 's."),
+        ('additional <a><calibrator file="c"/></a>', ": <calibrator> must not read another file"),
+        (f'routes <a {XI}><x:include href="/etc/b"/></a>', ": <include> must not read another"),
         ("additional <a><b/>", " must be XML"),
     ],
 )
@@ -72,6 +81,8 @@ def test_files_of_no_use_are_refused(tmp_path, change, message):
         routes, path, change = tmp_path / "all.rou.xml", tmp_path / "own.xml", ()
         routes.write_text("<routes><vehicle/></routes>")
         path.write_text(content)
-        check = replace(Files(tmp_path / "net.xml", (routes,)), **{kind: (path,)}).check
+        (tmp_path / "net.xml").write_text("<net/>")
+        files = replace(Files(tmp_path / "net.xml", (routes,)), **{kind: (path,)})
+        check = partial(files.check, 0)
     with pytest.raises(ValueError, match=f"^{re.escape(f'{kind}: {path}{message}')}"):
         check(*change)
