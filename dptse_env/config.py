@@ -96,7 +96,7 @@ class EnvConfig:
             corridor's name, if one ships, else the estimator's defaults. Parameters of one's own
             take those of the shipped ones that they were derived from.
         bandwidth: Largest total cost of the queries of a step, in ``bandwidth_unit``; by default a
-            number of mainline segments.
+            number of mainline segments. `resolve` limits a default to those that there are.
         query_spans: Numbers of neighbouring mainline segments that one query may cover, ascending.
             Several segments are released as one sum. Others than 1 need a release model that
             releases sums.
@@ -313,7 +313,8 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
 
     Warns:
         UserWarning: The corridor is another road, or the ARZ parameters are of one's own, and
-            values that were measured or tuned for others, or assumed, are used.
+            values that were measured or tuned for others, or assumed, are used; or the road is too
+            short for the default bandwidth.
     """
     require_name("preset", preset, PRESETS)
     corridor = overrides.get("corridor")
@@ -386,6 +387,14 @@ def _resolve(
     if not isinstance(values.get("penetration", {}), Mapping | Penetration):
         values["penetration"] = {"share": values["penetration"]}
     _read_seeds(values, corridor)
+    if "bandwidth" not in values and corridor.n_mainline < base.bandwidth:
+        values["bandwidth"] = corridor.n_mainline
+        warnings.warn(
+            f"bandwidth is {corridor.n_mainline}, the number of mainline segments, since nobody "
+            f"gave it and {corridor.name} is too short for the default of {base.bandwidth}",
+            UserWarning,
+            stacklevel=1,
+        )
     if isinstance(values.get("observation"), str):
         values["observation"] = (values["observation"],)
     settings = values.get("estimator_settings")

@@ -23,6 +23,7 @@ from dptse_env.importers import Options, Source, Split, import_trajectories, rea
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import ROAD
 from dptse_env.importers.network import (
+    PARAMETERS,
     Files,
     ImportedRoad,
     find_layout,
@@ -224,7 +225,8 @@ class Network:
             write_corridor(temporary, road.corridor, comment=describe(road))
         print(describe(road))
         print(f"written: {self.output}")
-        print(f"next: {shlex.join(('dptse', 'fit', self.output.as_posix()))}")
+        keywords = {"parameters": PARAMETERS}
+        print_next(self.output, {"test": KINDS["test"][:8]}, road.corridor, PAPER, keywords)
 
     def _files(self) -> Files:
         if self.configuration is not None:

@@ -146,7 +146,9 @@ class ARZModel:
 
     def require_time_step(self) -> None:
         """Raise ``ValueError`` where the time step violates the CFL condition on a segment."""
-        self.parameters.require_time_step(self.time_step, min(self.network.segment_lengths))
+        lengths, n = self.network.segment_lengths, self.network.n_mainline
+        field = "segment_length" if min(lengths) == min(lengths[:n]) else "ramp_length"
+        self.parameters.require_time_step(self.time_step, min(lengths), field)
 
     # States -------------------------------------------------------------------------------------
 

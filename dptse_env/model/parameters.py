@@ -92,26 +92,40 @@ class ARZParameters:
         forwards = 1.0 / (LARGEST_W / crossing + 1.0 / self.relaxation_time)
         return min(forwards, crossing / self.gamma)
 
-    def require_time_step(self, time_step: float, segment_length: float) -> None:
+    def shortest_segment(self, time_step: float) -> float:
+        """Return the least length of segments [km] on which the CFL condition has a time step [s].
+
+        It is rounded up to 0.1 m, and infinite where no segment is long enough.
+        """
+        share = 1.0 - time_step / self.relaxation_time
+        if time_step <= 0.0 or share <= 0.0:
+            return math.inf
+        waves = max(LARGEST_W / share, self.gamma) * self.free_flow_speed
+        return math.ceil(1e4 * time_step * waves / SECONDS_PER_HOUR) / 1e4
+
+    def require_time_step(
+        self, time_step: float, length: float, field: str = "segment_length"
+    ) -> None:
         """Refuse a time step [s] that violates the CFL condition on a segment [km].
+
+        Args:
+            time_step: The time step.
+            length: The length of the segment.
+            field: The field of the corridor that has this length.
 
         Raises:
             ValueError: It does; the message has the shortest segment of this time step, if any.
         """
-        largest = self.largest_time_step(segment_length)
+        largest = self.largest_time_step(length)
         if 0.0 < time_step <= largest:
             return
         # Rounded so that the numbers in the message are admissible.
         named = math.floor(100.0 * largest) / 100.0
-        share = 1.0 - time_step / self.relaxation_time
-        allowed = "longer"
-        if time_step > 0.0 and share > 0.0:
-            waves = max(LARGEST_W / share, self.gamma) * self.free_flow_speed
-            least = math.ceil(1e4 * time_step * waves / SECONDS_PER_HOUR) / 1e4
-            allowed = f"at least {least:g} km"
+        least = self.shortest_segment(time_step)
+        allowed = f"at least {least:g} km" if math.isfinite(least) else "longer"
         raise ValueError(
-            f"corridor.segment_length must be {allowed} for the parameters {self.name!r}, got "
-            f"{segment_length:g} km: there their CFL condition needs a time step > 0 and at most "
+            f"corridor.{field} must be {allowed} for the parameters {self.name!r}, got "
+            f"{length:g} km: there their CFL condition needs a time step > 0 and at most "
             f"{named:.2f} s, got {time_step:g} s"
         )
 

@@ -28,7 +28,8 @@ import platformdirs
 from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.imported import load_record, record_path, require_seeds
+from dptse_env.traffic.imported import load_record, ranges, record_path, require_seeds
+from dptse_env.traffic.own_sumo import kind_of
 from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
 from dptse_env.traffic.recording import record_seeds
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, sumo_version
@@ -188,7 +189,14 @@ class RecordLibrary:
         sources = {seed: _source(corridor, seed) for seed in seeds}
         about = {"desc": f"recording {corridor.name}", "unit": "seed"}
         with tqdm(total=len(seeds), disable=not progress, **about) as bar:
-            record_seeds(corridor, paths, sources, workers, bar.update)
+            told: dict[str, list[tuple[int, str]]] = {}
+            record_seeds(
+                corridor, paths, sources, workers, bar.update,
+                lambda seed, text: told.setdefault(kind_of(text), []).append((seed, text)),
+            )  # fmt: skip
+        for of_kind in told.values():
+            seeds, (first, *_) = zip(*of_kind, strict=True)
+            logger.warning("%s, traffic seeds %s: %s", corridor.name, ranges(seeds), first)
 
     @contextlib.contextmanager
     def _explained_errors(self, corridor: Corridor, seeds: list[int]) -> Iterator[None]:

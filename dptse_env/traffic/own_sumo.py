@@ -11,7 +11,7 @@ import re
 import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf
@@ -34,6 +34,11 @@ StepLength = Annotated[float, Interval(0.01, 1.0)]
 Clock = Annotated[int, Interval(0, 10_000_000)]
 """Whole seconds of SUMO's clock."""
 
+_DEVICES = (
+    "battery|bluelight|driverstate|elechybrid|friction|glosa|rerouting|stationfinder|taxi|toc"
+)
+"""Devices of vehicles that change the traffic; others measure it."""
+
 TRAFFIC = re.compile(
     r"(intermodal-)?collision\..+|default\..+|emergencydecel\..+|extrapolate-departpos|ignore-.+"
     r"|insertion-checks|junction-taz|keep-after-arrival|lanechange\..+|lateral-resolution"
@@ -43,8 +48,7 @@ TRAFFIC = re.compile(
     r"|route-steps|routing-algorithm|scale-suffix|slope-centered|(sloppy|eager|emergency)-insert"
     r"|startup-wait-threshold|step-method\.ballistic|thread-rngs|time-to-(impatience|teleport).*"
     r"|tls\..+|use-stop-.+|waiting-time-memory|weight-attribute|weights\..+"
-    r"|(person-)?device\.(battery|bluelight|driverstate|elechybrid|friction|glosa|rerouting"
-    r"|stationfinder|taxi|toc)\.(?!(.+\.)?(file|output)$).+"
+    rf"|(person-)?device\.({_DEVICES})\.(?!(.+\.)?(file|output)$).+"
 )
 """Options of SUMO that change the traffic and name no file. All others write, measure or show
 something, read a file that no digest covers, or are set by a recording."""
@@ -55,8 +59,17 @@ READ_BY = frozenset(["rerouter", "variableSpeedSign", "vss", "calibrator", "incl
 UNREADABLE = (SyntaxError, LookupError, ValueError, EOFError, zlib.error, gzip.BadGzipFile)
 """Errors of reading a file that is no XML, or is cut or damaged."""
 
+WARNING = "Warning: "
+"""Start of a line with a warning of SUMO."""
+
+MOST_KINDS = 5
+"""Kinds of warnings that are told."""
+
 TOLERANCE = 0.01
 """Precision of lengths in network files [m]."""
+
+Remark = Callable[[str], object]
+"""Takes a sentence for people."""
 
 KMH = 3.6
 """Factor from m/s to km/h."""
@@ -64,6 +77,8 @@ KMH = 3.6
 _PATH = "corridor.network"
 _FILE = re.compile(r"(^|[._-])(files?|output|dest|href)$|File$|Output$")
 """Attributes, and keys of parameters, that name files."""
+_MEASURES = re.compile(rf"(has|(person-)?device)\.(?!({_DEVICES})\.)")
+"""Keys of parameters of devices that change no traffic."""
 _ELSEWHERE = re.compile(r"\s*([/\\~]|[A-Za-z]:[/\\])|(.*[/\\])?\.\.([/\\]|$)|.*(\$|://)")
 """Values of parameters that name a place outside of the folder that SUMO runs in."""
 _DEPARTURES = {
@@ -296,6 +311,31 @@ def observe(
     return rows
 
 
+def tell_departures(libsumo: ModuleType, remark: Remark) -> None:
+    """Tell how many vehicles a simulation has loaded that have not departed."""
+    loaded, departed = (
+        int(libsumo.simulation.getParameter("", f"stats.vehicles.{name}"))
+        for name in ("loaded", "inserted")
+    )
+    if departed < loaded:
+        remark(f"{loaded - departed} of {loaded} vehicles that SUMO loaded had not departed")
+
+
+def kind_of(text: str) -> str:
+    """Return a message without the names and numbers by which others of its kind differ."""
+    return re.sub(r"'[^']*'|[\d.]+", "", text)
+
+
+def tell_warnings(messages: Path, remark: Remark) -> None:
+    """Tell the most frequent kinds of SUMO's warnings in a file of its messages."""
+    kinds: dict[str, list[str]] = {}
+    for line in messages.read_text(encoding="utf-8", errors="replace").splitlines():
+        if line.startswith(WARNING):
+            kinds.setdefault(kind_of(line), []).append(line)
+    for lines in sorted(kinds.values(), key=len, reverse=True)[:MOST_KINDS]:
+        remark(f"SUMO warns, {len(lines)} times: {lines[0].removeprefix(WARNING):.300}")
+
+
 class VehicleLimits:
     """Limits of incidents, for the vehicles on their segments.
 
@@ -352,6 +392,11 @@ class Copied:
     is_sorted: bool = True
     outputs: Counter[str] = field(default_factory=Counter)
     reads: list[str] = field(default_factory=list)
+
+    def read(self, what: str, name: str) -> None:
+        """Note that something reads another file."""
+        allowed = f"must not read another file, got {shown(name)}: put its content in its place"
+        self.reads.append(f"{what} {allowed}")
 
 
 def copy_input(path: Path, copy: Path, begin: float) -> Copied:
@@ -411,7 +456,10 @@ def _without_files(element: ElementTree.Element, found: Copied) -> bool:
     element.tag = tag = element.tag.rpartition("}")[2]
     if tag == "param":
         key = element.get("key", "")
-        if _FILE.search(key) or _ELSEWHERE.match(element.get("value", "")):
+        value = element.get("value", "")
+        if key.startswith("device.fcd-replay.file"):
+            found.read(key, value)
+        if _FILE.search(key) or _MEASURES.match(key) or _ELSEWHERE.match(value):
             found.outputs[key] += 1
             return False
     for name, value in list(element.attrib.items()):
@@ -419,10 +467,7 @@ def _without_files(element: ElementTree.Element, found: Copied) -> bool:
             continue
         del element.attrib[name]
         if tag in READ_BY and name in ("file", "href"):
-            found.reads.append(
-                f"<{tag}> must not read another file, got {shown(value)}: put its content in its "
-                "place"
-            )
+            found.read(f"<{tag}>", value)
         elif name in ("file", "dest", "output"):
             found.outputs[tag] += 1
             if name != "output":  # SUMO asks for the others

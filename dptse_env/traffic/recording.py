@@ -26,6 +26,7 @@ from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool
 
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.own_sumo import Remark
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
 from dptse_env.traffic.sumo_input import NetworkError
@@ -50,6 +51,7 @@ def record_seeds(
     sources: Sources,
     workers: int = 1,
     done: Callable[[], object] = lambda: None,
+    remark: Callable[[int, str], object] = lambda seed, text: None,
 ) -> None:
     """Record traffic seeds, several at once.
 
@@ -59,6 +61,7 @@ def record_seeds(
         sources: What is saved with each.
         workers: Number of processes.
         done: Called after each record.
+        remark: Takes what is unusual of the traffic of a seed; see `simulate`.
 
     Raises:
         RecordingError: A recording fails, or `ATTEMPTS` workers died on a seed. Recordings in
@@ -69,7 +72,9 @@ def record_seeds(
     """
     waiting, deaths = dict(paths), Counter[int]()
 
-    def finished(seed: int) -> None:
+    def finished(seed: int, remarks: list[str]) -> None:
+        for text in remarks:
+            remark(seed, text)
         del waiting[seed]
         done()
 
@@ -88,11 +93,11 @@ def record_seeds(
             logger.warning("%s: %s; recording again: traffic seeds %s", corridor.name, cause, again)
 
 
-def simulate_in_worker(corridor: Corridor, seed: int) -> Record:
-    """Simulate and record one scenario in another process; errors are those of `record_seeds`."""
+def simulate_in_worker(corridor: Corridor, seed: int, remark: Remark = lambda text: None) -> Record:
+    """Do as `simulate` in another process; errors are those of `record_seeds`."""
     with tempfile.TemporaryDirectory(prefix="dptse-record-") as folder:
         path = Path(folder) / "record"
-        record_seeds(corridor, {seed: path}, {seed: {}})
+        record_seeds(corridor, {seed: path}, {seed: {}}, remark=lambda _, text: remark(text))
         return Record.load(path, {}, corridor.record_shape)
 
 
@@ -101,10 +106,10 @@ def _record_until_death(
     paths: Mapping[int, Path],
     sources: Sources,
     workers: int,
-    finished: Callable[[int], None],
+    finished: Callable[[int, list[str]], None],
 ) -> tuple[list[int], str]:
     """Record until all is done or a worker dies; return what was in progress then, and why."""
-    waiting, running, cause = iter(paths), dict[Future[None], int](), ""
+    waiting, running, cause = iter(paths), dict[Future[list[str]], int](), ""
     n_workers = min(workers, len(paths))
     with _worker_processes(n_workers) as pool:
         while not cause:
@@ -120,11 +125,11 @@ def _record_until_death(
                 break
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 try:
-                    future.result()
+                    remarks = future.result()
                 except BrokenProcessPool as error:
                     cause = _cause(error)
                 else:
-                    finished(running.pop(future))
+                    finished(running.pop(future), remarks)
     return list(running.values()), cause
 
 
@@ -193,14 +198,16 @@ def _wait_for_end(parent: int) -> None:
             time.sleep(WATCH)
 
 
-def _record(corridor: Corridor, seed: int, path: Path, source: dict[str, object]) -> None:
+def _record(corridor: Corridor, seed: int, path: Path, source: dict[str, object]) -> list[str]:
+    remarks: list[str] = []
     try:
-        simulate(corridor, seed).save(path, source)
+        simulate(corridor, seed, remarks.append).save(path, source)
     except (RecordingError, NetworkError, SumoVersionError, MissingExtraError):
         raise
     except Exception as error:
         cause = f"{type(error).__name__}: {error}"
         raise RecordingError.from_cause(corridor, seed, cause) from error
+    return remarks
 
 
 def _cause(error: BrokenProcessPool) -> str:

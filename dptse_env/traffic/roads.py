@@ -237,9 +237,9 @@ def write_corridor(
         given = getattr(corridor, name)
         if given is None:
             continue
-        folder, home = Path(given.folder).absolute(), Path(path).absolute().parent
-        if folder.is_relative_to(home):  # so that the folder can be moved with the file in it
-            content[name]["folder"] = folder.relative_to(home).as_posix()
+        folder, home = Path(given.folder).resolve(), Path(path).resolve().parent
+        if folder.is_relative_to(home.parent):  # so that both can be moved together
+            content[name]["folder"] = Path(os.path.relpath(folder, home)).as_posix()
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())

@@ -27,7 +27,7 @@ import numpy as np
 from dptse_env.traffic import own_sumo
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Incident, lowest_limit
-from dptse_env.traffic.own_sumo import KMH
+from dptse_env.traffic.own_sumo import KMH, WARNING, Remark
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import Scenario, draw_scenario
 from dptse_env.traffic.sumo_input import LONGEST_OUTPUT, edge_ids, network_xml, routes_xml
@@ -44,7 +44,6 @@ SUBSTEPS = round(1.0 / STEP_LENGTH)
 QUIET = (
     "--no-step-log",
     "--duration-log.disable",
-    "--no-warnings",
     "--xml-validation=never",
     "--xml-validation.net=never",
     "--xml-validation.routes=never",
@@ -53,6 +52,7 @@ QUIET = (
 
 OPTIONS = (
     f"--step-length={STEP_LENGTH}",
+    "--no-warnings",
     "--no-internal-links",
     "--collision.action=none",
     # Vehicles that stand still in a jam are not removed.
@@ -92,11 +92,16 @@ def sumo_version() -> str:
     return version
 
 
-def simulate(corridor: Corridor, seed: int) -> Record:
+def simulate(corridor: Corridor, seed: int, remark: Remark = lambda text: None) -> Record:
     """Simulate one scenario in this process and record it.
 
     The same corridor and seed give the same record, bit for bit, in any process. Meanwhile the
     process's current folder is a temporary one, so that SUMO writes nothing elsewhere.
+
+    Args:
+        corridor: The road.
+        seed: The traffic seed.
+        remark: Takes what SUMO warns of on a network of one's own, and who does not depart.
 
     Raises:
         RecordingError: SUMO fails, the corridor's own files are missing or changed, or libsumo
@@ -105,7 +110,7 @@ def simulate(corridor: Corridor, seed: int) -> Record:
         SumoVersionError: libsumo is missing, broken or of another release series.
     """
     scenario = draw_scenario(corridor, seed)
-    with running(corridor, scenario) as libsumo:
+    with running(corridor, scenario, remark) as libsumo:
         if corridor.network is None:
             return _observe(libsumo, corridor, scenario)
         clock = seconds(libsumo, corridor, scenario)
@@ -119,7 +124,9 @@ def simulate(corridor: Corridor, seed: int) -> Record:
 
 
 @contextlib.contextmanager
-def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
+def running(
+    corridor: Corridor, scenario: Scenario, remark: Remark = lambda text: None
+) -> Iterator[ModuleType]:
     """Load a scenario into SUMO, at second 0, and close it afterwards.
 
     In the body the current folder is an empty one, where SUMO runs.
@@ -144,16 +151,19 @@ def running(corridor: Corridor, scenario: Scenario) -> Iterator[ModuleType]:
         try:
             command = [*_command(folder, network, corridor, scenario), *QUIET]
             # Names in the folder are plain ASCII: SUMO opens no others where the locale is C.
-            with contextlib.chdir(folder):
+            with contextlib.chdir(folder), _stderr_to(messages):
                 try:
-                    with _stderr_to(messages):
-                        libsumo.start(command)
+                    libsumo.start(command)
                     yield libsumo
+                    if corridor.network is not None:
+                        own_sumo.tell_departures(libsumo, remark)
                 finally:
                     if libsumo.isLoaded():
                         libsumo.close()
+            own_sumo.tell_warnings(messages, remark)
         except Exception as error:
-            output = messages.read_text(encoding="utf-8", errors="replace").strip()
+            said = messages.read_text(encoding="utf-8", errors="replace").splitlines()
+            output = "\n".join(line for line in said if not line.startswith(WARNING)).strip()
             output = output[-LONGEST_OUTPUT:]
             cause = f"{type(error).__name__}: {error}" + (f"\n{output}" if output else "")
             raise RecordingError.from_cause(corridor, scenario.seed, cause) from error

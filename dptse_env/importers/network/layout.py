@@ -18,11 +18,15 @@ from dptse_env.importers.network.net import (
     predecessors,
     successors,
 )
+from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic.own_sumo import TOLERANCE, Stretch
 from dptse_env.utils.fields import require, shown
 
-SHORTEST = 40.0
-"""Shortest segment [m]."""
+PARAMETERS = "w99-3lane"
+"""Shipped parameters that allow the shortest segments."""
+
+SHORTEST = 1000.0 * load_parameters(PARAMETERS).shortest_segment(1.0)
+"""Shortest segment [m], on the mainline and on ramps: an environment has steps of a second."""
 
 LONGEST = 1e6
 """Longest lane [m]."""
@@ -97,7 +101,7 @@ def find_layout(
             too short, or ramps are too near to one another or to its ends; the message names the
             file or the field.
     """
-    allowed = f"at least {SHORTEST:.0f} m"
+    allowed = f"at least {SHORTEST:g} m"
     require(segment_length >= SHORTEST, "segment_length", allowed, segment_length)
     require(len(path) >= 1, "path", "at least one edge", list(path))
     net = Net(files.net, files.internal_links)
@@ -394,7 +398,7 @@ def _merged(ramps: list[Ramp], chain: Chain) -> tuple[list[Ramp], list[str]]:
         apart = place - chain.ends[last.junction] if last else np.inf
         if ramp.usable < 2 * SHORTEST:
             problems.append(
-                f"{ramp} has {ramp.usable:.0f} m of the {2 * SHORTEST:.0f} m for a segment and a "
+                f"{ramp} has {ramp.usable:.1f} m of the {2 * SHORTEST:g} m for a segment and a "
                 "boundary segment"
             )
             dropped += ramp.names

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,13 +77,13 @@ def import_road(
     if begin is None:
         require(float(files.begin).is_integer(), "begin", "whole seconds", files.begin)
         begin = int(files.begin) + warm_up
-    remarks = (*layout.remarks, *files.check(begin - warm_up))
+    remarks = [*layout.remarks, *files.check(begin - warm_up)]
     try:
         draft = _draft(files, layout, name, duration, begin, warm_up, speed_limit)
     except ValueError as problem:
         raise ValueError(f"net: {files.net}: {problem}") from problem
     try:
-        record = simulate_in_worker(draft, seed)
+        record = simulate_in_worker(draft, seed, remarks.append)
     except RecordingError as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"net: {files.net}: SUMO refuses these files: {reason:.500}") from error
@@ -107,8 +107,26 @@ def import_road(
     inside = (first.argmin(axis=1) < draft.n_mainline) & (first.min(axis=1) > 0)
     if inside.any():
         share = f"{inside.sum()} of {record.n_vehicles} vehicles"
-        remarks += (f"{share} appear on the mainline, past every entrance",)
-    return ImportedRoad(corridor, layout, record, remarks)
+        remarks.append(f"{share} appear on the mainline, past every entrance")
+    if not record.counts[0, : draft.n_mainline].any():
+        remarks.append("the record begins on an empty mainline; a warm-up fills it")
+    remarks += [f"no vehicle {text}" for text in _unused(draft, layout.names, first)]
+    remarks.append(
+        "fixed sensors are assumed on the last mainline segment and on off-ramps: "
+        f"fixed_sensors = {list(draft.fixed_sensors)}"
+    )
+    return ImportedRoad(corridor, layout, record, tuple(remarks))
+
+
+def _unused(corridor: Corridor, names: Sequence[str], first: IntArray) -> Iterator[str]:
+    """Yield the entrances and exits that no vehicle takes, for people."""
+    N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
+    ends = ["enters at the upstream end", "leaves at the downstream end"]
+    ramps = [f"{'enters by' if i < n_on else 'leaves by'} {name}" for i, name in enumerate(names)]
+    for i, text in enumerate([*ends, *ramps]):
+        columns = [S + i] if i < 2 else [S + i, N + i - 2]
+        if (first[:, columns] == NEVER).all():
+            yield text
 
 
 def _draft(
