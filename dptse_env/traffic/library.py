@@ -195,8 +195,8 @@ class RecordLibrary:
                 lambda seed, text: told.setdefault(kind_of(text), []).append((seed, text)),
             )  # fmt: skip
         for of_kind in told.values():
-            seeds, (first, *_) = zip(*of_kind, strict=True)
-            logger.warning("%s, traffic seeds %s: %s", corridor.name, ranges(seeds), first)
+            where = ranges(seed for seed, _ in of_kind)
+            logger.warning("%s, traffic seeds %s: %s", corridor.name, where, of_kind[0][1])
 
     @contextlib.contextmanager
     def _explained_errors(self, corridor: Corridor, seeds: list[int]) -> Iterator[None]:

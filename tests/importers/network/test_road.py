@@ -1,6 +1,7 @@
 """Records of a network of one's own, against what SUMO says of it."""
 
 import dataclasses
+import gzip
 import re
 import shutil
 from pathlib import Path
@@ -9,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from dptse_env.importers.network import Files, find_layout, import_road
+from dptse_env.importers.network import Files, find_layout, import_road, read_configuration
 from dptse_env.traffic import (
     MAINLINE,
     SHORT_HIGHWAY,
@@ -21,6 +22,7 @@ from dptse_env.traffic import (
     simulate,
     write_corridor,
 )
+from dptse_env.traffic.own_sumo import TRAFFIC, copy_input
 from dptse_env.traffic.sumo import running, seconds
 from dptse_env.traffic.sumo_input import packaged_network
 from dptse_env.utils.files import file_digest
@@ -157,7 +159,11 @@ def test_demand_exit_shares_and_dwell_are_counted(road):
     assert corridor.exit_shares[0] == pytest.approx(300 / 2200, rel=0.3)
     assert 3.0 < corridor.average_dwell < 6.0
     assert corridor.measured == ("demand", "exit_shares", "average_dwell")
-    assert road.remarks == ()
+    assert road.remarks == (
+        "the record begins on an empty mainline; a warm-up fills it",
+        f"fixed sensors are assumed on the last mainline segment and on off-ramps: "
+        f"fixed_sensors = {list(corridor.fixed_sensors)}",
+    )
 
 
 def test_an_incident_slows_the_vehicles_on_its_segment_alone(road):
@@ -222,7 +228,7 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
 def test_scenarios_and_corridors_of_no_use_are_refused(road):
     network = road.corridor.network
     for change, message in (
-        ({"options": ("--fcd-output=all.xml",)}, "options must be free of outputs"),
+        ({"options": ("--fcd-output=all.xml",)}, "options must be options that change the traffic"),
         ({"options": ("-v",)}, "options must be --name=value each"),
         ({"step_length": 0.3}, "step_length must be a whole part of a second"),
         ({"sha256": ()}, "sha256 must be one for each of 2 files"),
@@ -238,10 +244,105 @@ def test_scenarios_and_corridors_of_no_use_are_refused(road):
         dataclasses.replace(road.corridor, drivers=Drivers("IDM"))
 
 
-def test_additional_files_write_nothing(files, tmp_path):
-    extra, written = tmp_path / "own.add.xml", tmp_path / "out.xml"
-    loop = f'<inductionLoop id="d" lane="narrow_0" pos="5" period="10" file="{written}"/>'
-    extra.write_text(f"<additional>{loop}</additional>")
-    more = dataclasses.replace(files, additional=(extra,))
-    import_road(more, find_layout(files, PATH, 100.0), "road", 60)
-    assert not written.exists()
+WRITERS = """
+    <inductionLoop id="e1" lane="narrow_0" pos="5" period="10" file="{}"/>
+    <instantInductionLoop id="i1" lane="narrow_0" pos="5" file="{}"/>
+    <laneAreaDetector id="e2" lane="narrow_0" pos="5" endPos="50" period="10" file="{}"/>
+    <entryExitDetector id="e3" period="10" file="{}">
+        <detEntry lane="narrow_0" pos="5"/><detExit lane="narrow_0" pos="90"/>
+    </entryExitDetector>
+    <edgeData id="edges" period="10" file="{}"/> <laneData id="lanes" period="10" file="{}"/>
+    <vTypeProbe id="probe" type="car" period="10" file="{}"/>
+    <routeProbe id="routes" edge="in" period="10" file="{}"/>
+    <calibrator id="c" edge="in" pos="0" period="10" output="{}" routeProbe="routes"/>
+    <wrapped><e1Detector id="e4" lane="narrow_0" pos="5" period="10" file="{}"/></wrapped>"""
+EQUIPPED = """
+    <param key="has.ssm.device" value="true"/> <param key="device.ssm.file" value="{}"/>
+    <param key="has.toc.device" value="true"/>
+    <param key="device.toc.manualType" value="car"/>
+    <param key="device.toc.automatedType" value="van"/> <param key="device.toc.file" value="{}"/>
+    <param key="has.example.device" value="true"/> <param key="device.example.log" value="{}"/>
+    <param key="device.rerouting.output" value="{}"/>"""
+VEHICLES = """<routes>
+    <vType id="car">{}</vType>
+    <vTypeDistribution id="any"><vType id="van">{}</vType></vTypeDistribution>
+    <flow id="f" type="car" from="in" to="out" begin="0" end="30" vehsPerHour="900">{}</flow>
+    <vehicle id="v" depart="1" type="any"><route edges="in merge"/>{}</vehicle>
+    <trip id="t" depart="2" type="any" from="in" to="out">{}</trip>
+</routes>"""
+
+
+def options_of(*topics):
+    """Return the options of SUMO in topics of its configuration, and whether they are files."""
+    sumo = pytest.importorskip("sumo", reason="eclipse-sumo (extra corridors) is missing")
+    schema = ElementTree.parse(
+        Path(sumo.__file__).parent / "data" / "xsd" / "types" / "sumoConfigurationType.xsd"
+    )
+    return {
+        element.get("name"): element.get("type") == "fileOptionType"
+        for kind in schema.findall("{*}complexType")
+        if not topics or kind.get("name").removeprefix("sumo").removesuffix("TopicType") in topics
+        for element in kind.findall(".//{*}element")
+    }
+
+
+def test_options_of_the_traffic_are_told_from_all_others():
+    assert not [name for name, is_file in options_of().items() if is_file and taken(name)]
+    assert not list(filter(taken, options_of("configuration", "output", "report", "ssm_device")))
+    traffic = options_of("processing", "routing")
+    left_out = {name for name in traffic if not taken(name)}
+    assert left_out == {
+        "threads", "scale", "astar.all-distances", "astar.landmark-distances",
+        "device.rerouting.output",
+    }  # fmt: skip
+
+
+def taken(option):
+    return TRAFFIC.fullmatch(option) is not None
+
+
+@pytest.mark.parametrize("place", ["{root}/kept.xml", "{root}/missing/new.xml", "kept.xml"])
+def test_nothing_that_files_name_is_written(files, place, tmp_path, monkeypatch):
+    root = tmp_path / "theirs"
+    root.mkdir()
+    monkeypatch.chdir(root)
+    place = place.format(root=root)
+    named = iter(lambda: place, None)
+
+    def filled(text):
+        return re.sub(r"\{\}", lambda _: next(named), text)
+
+    Path("kept.xml").write_text("results of a week")
+    shutil.copy(files.net, "road.net.xml")
+    Path("more.add.xml").write_bytes(
+        gzip.compress(f"<additional>{filled(WRITERS)}</additional>".encode())
+    )
+    Path("road.rou.xml").write_text(VEHICLES.replace("{}", filled(EQUIPPED)))
+    outputs = [name for name, is_file in options_of("output", "report").items() if is_file]
+    options = "".join(f'<{name} value="{place}"/>' for name in [*outputs, "device.ssm.file"])
+    Path("road.sumocfg").write_text(
+        '<configuration><net-file value="road.net.xml"/><route-files value="road.rou.xml"/>'
+        '<additional-files value="more.add.xml"/><device.ssm.probability value="1"/>'
+        f'<save-state.times value="5"/>{options}</configuration>'
+    )
+    before = {path: file_digest(path) for path in root.rglob("*")}
+    read = read_configuration(root / "road.sumocfg")
+    road = import_road(read, find_layout(read, PATH, 100.0), "road", 30)
+    assert {path: file_digest(path) for path in root.rglob("*")} == before
+    assert any("more.add.xml: outputs that are not written: 1 of inductionLoop" in each for each in road.remarks)
+
+
+def test_a_copy_for_sumo_names_no_file_and_keeps_all_else(tmp_path):
+    given, copy = tmp_path / "given.xml", tmp_path / "copy.xml"
+    switched = '<timedEvent type="SaveTLSStates" source="j" dest="{}"/>'
+    actuated = '<tlLogic id="j"><param key="file" value="{}"/><param key="in_0" value="e1"/></tlLogic>'
+    text = f"<all>{WRITERS}{switched}{actuated}<vType id='&lt;ü' maxAccelProfile='1'/></all>"
+    given.write_text(text.replace("{}", "a week/results"), encoding="utf-16")
+    found = copy_input(given, copy, 0.0)
+    assert found.outputs["timedEvent"] == found.outputs["file"] == 1
+    expected = re.sub(r'output="{}" |<param key="file" value="{}"/>', "", text).replace("{}", "NUL")
+    assert canonicalize(copy.read_text()) == canonicalize(expected)
+
+
+def canonicalize(text):
+    return ElementTree.canonicalize(text, strip_text=True)
