@@ -3,11 +3,13 @@
 import dataclasses
 import json
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from dptse_env.config import resolve
 from dptse_env.estimators import ESTIMATORS, EstimatorSettings
 from dptse_env.estimators.ekf import count_variance
 from dptse_env.estimators.settings import load_settings, write_settings
@@ -91,6 +93,25 @@ def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):
         make(str(road), parameters="paper")
     # A random walk does not step the model.
     make(str(road), parameters="paper", estimator="random_walk").reset(seed=0)
+
+
+def test_a_ramp_that_is_too_short_is_named_as_the_file_has_it(tmp_path):
+    road = dataclasses.replace(ROAD, ramp_length=0.05)
+    write_corridor(tmp_path / "ramp.toml", road)
+    with pytest.raises(
+        ValueError, match=r"ramp\.toml: corridor\.ramp_length must be at least 0\.05"
+    ):
+        make(str(tmp_path / "ramp.toml"), parameters="paper")
+
+
+def test_a_default_bandwidth_is_limited_to_the_road_and_a_given_one_is_not(tmp_path):
+    path = str(tmp_path / "two.toml")
+    Path(path).write_text("n_mainline = 2\nduration = 60\n[demand]\nmainline = [[0, 900]]\n")
+    with pytest.warns(UserWarning) as told:
+        assert resolve("paper-highway", {"corridor": path}).bandwidth == 2
+    assert str(told[0].message).startswith("bandwidth is 2, the number of mainline segments")
+    with pytest.raises(ValueError, match=r"bandwidth must be in 1\.\.2, got 5"):
+        resolve("paper-highway", {"corridor": path, "bandwidth": 5})
 
 
 def test_python_tells_once_what_is_not_of_the_road(road_file):

@@ -98,7 +98,7 @@ class ARZParameters:
         It is rounded up to 0.1 m, and infinite where no segment is long enough.
         """
         share = 1.0 - time_step / self.relaxation_time
-        if time_step <= 0.0 or share <= 0.0:
+        if not (time_step > 0.0 and share > 0.0):
             return math.inf
         waves = max(LARGEST_W / share, self.gamma) * self.free_flow_speed
         return math.ceil(1e4 * time_step * waves / SECONDS_PER_HOUR) / 1e4

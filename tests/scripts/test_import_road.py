@@ -6,14 +6,16 @@ import re
 import shlex
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents.environments import parse_env
 from dptse_env.traffic import Demand, RecordLibrary, read_corridor
 from tests.agents.test_measured_field import source
 from tests.helpers import ROOT, make_env
 from tests.importers.data import STRAIGHT, driven, plain, stream, write_csv
-from tests.importers.network.conftest import PATH, motorway
+from tests.importers.network.conftest import PATH, motorway, netconvert
 from tests.importers.test_tables import FOOT, ngsim
 from tests.scripts.commands import refused, run_command
 
@@ -222,6 +224,32 @@ def test_a_network_becomes_a_road_of_any_environment(town):
     for _ in range(60):
         *_, info = env.step(env.action_space.sample())
     assert info["n_occupied"] > 5
+
+
+NODES = """<nodes>
+    <node id="a" x="0" y="0"/> <node id="b" x="600" y="0"/> <node id="c" x="1200" y="0"/>
+    <node id="d" x="530" y="-42"/>
+</nodes>"""
+EDGES = """<edges>
+    <edge id="m1" from="a" to="b" numLanes="2" speed="36"/>
+    <edge id="m2" from="b" to="c" numLanes="2" speed="36"/>
+    <edge id="on" from="d" to="b" numLanes="1" speed="14" length="{}"/>
+</edges>"""
+
+
+def test_what_is_imported_can_be_played_as_the_last_line_says(tmp_path):
+    routes = tmp_path / "road.rou.xml"
+    routes.write_text('<routes><flow id="f" from="m1" to="m2" end="60" period="4"/></routes>')
+    words = "network", "--net", tmp_path / "road.net.xml", "--routes", routes, "--path", "m1 m2"
+    more = "--segment-length", "300", "--duration", "60", "--output", tmp_path / "road.toml"
+    netconvert(tmp_path, NODES, EDGES.format(76), "<connections/>")
+    assert " of the 87.4 m for a segment and a boundary" in refused("import", *words, *more)
+    netconvert(tmp_path, NODES, EDGES.format(81), "<connections/>")
+    *_, last = run(*words, *more).splitlines()
+    env, keywords = parse_env(shlex.split(last)[shlex.split(last).index("--env") + 1])
+    with pytest.warns(UserWarning, match="values measured or tuned on"):
+        made = gym.make(env, **keywords)
+    assert made.unwrapped.config.corridor.n_mainline == 2
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,11 @@
 
 import dataclasses
 import gzip
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -147,6 +150,52 @@ def _vehicles(corridor, scenario):
         )  # fmt: skip
         ElementTree.SubElement(vehicle, "route", edges=" ".join(edges))
     return root
+
+
+def test_vehicles_out_of_order_depart_and_what_nobody_takes_is_told(files, tmp_path):
+    routes = FLOWS.replace('id="l"', 'id="l" begin="300"')  # before the flow that joins
+    lines = [line for line in routes.splitlines() if "flow" in line]
+    in_order = routes.replace(lines[1] + "\n", "").replace(lines[2], f"{lines[2]}\n{lines[1]}")
+    roads = []
+    for name, text in (("mixed", routes), ("in-order", in_order)):
+        (tmp_path / name).write_text(text)
+        own = dataclasses.replace(files, routes=(tmp_path / name,))
+        roads.append(import_road(own, find_layout(own, PATH, 100.0), "road", 60))
+    mixed, sorted_road = roads
+    assert mixed.record.digest == sorted_road.record.digest
+    assert "mixed: out of order of departure" in " ".join(mixed.remarks)
+    assert "out of order" not in " ".join(sorted_road.remarks)
+    assert {f"no vehicle leaves {how}" for how in ("at the downstream end", "by exit-a")} <= {
+        *mixed.remarks
+    }
+
+
+LOCAL = """
+import pathlib, sys
+from dptse_env.importers.network import Files, find_layout, import_road
+from dptse_env.traffic import RecordLibrary, SHORT_HIGHWAY
+files = Files(pathlib.Path("road.net.xml"), (pathlib.Path("road.rou.xml"),))
+road = import_road(files, find_layout(files, sys.argv[1:], 100.0), "road", 30).corridor
+longer = SHORT_HIGHWAY.replaced({"segment_length": 0.15, "duration": 30, "incident": None})
+for corridor in (road, SHORT_HIGHWAY, longer):
+    print(RecordLibrary("Aufzeichnungen für mich").get(corridor, 0).n_rows)
+"""
+
+
+@pytest.mark.parametrize("locale", ["C", "POSIX"])
+def test_letters_beyond_ascii_in_folders_are_of_no_matter(locale, files, tmp_path):
+    folder = tmp_path / "Meine Straße"
+    folder.mkdir()
+    for path in (files.net, *files.routes):
+        shutil.copy(path, folder)
+    places = dict.fromkeys(("TMPDIR", "HOME", "TEMP", "TMP"), str(folder))
+    done = subprocess.run(
+        [sys.executable, "-c", LOCAL, *PATH],
+        env=os.environ | places | {"LC_ALL": locale, "PYTHONPATH": str(Path.cwd())},
+        cwd=folder, capture_output=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr.decode()
+    assert all(int(count) > 0 for count in done.stdout.split())
 
 
 def test_demand_exit_shares_and_dwell_are_counted(road):
@@ -329,13 +378,18 @@ def test_nothing_that_files_name_is_written(files, place, tmp_path, monkeypatch)
     read = read_configuration(root / "road.sumocfg")
     road = import_road(read, find_layout(read, PATH, 100.0), "road", 30)
     assert {path: file_digest(path) for path in root.rglob("*")} == before
-    assert any("more.add.xml: outputs that are not written: 1 of inductionLoop" in each for each in road.remarks)
+    assert any(
+        "more.add.xml: outputs that are not written: 1 of inductionLoop" in each
+        for each in road.remarks
+    )
 
 
 def test_a_copy_for_sumo_names_no_file_and_keeps_all_else(tmp_path):
     given, copy = tmp_path / "given.xml", tmp_path / "copy.xml"
     switched = '<timedEvent type="SaveTLSStates" source="j" dest="{}"/>'
-    actuated = '<tlLogic id="j"><param key="file" value="{}"/><param key="in_0" value="e1"/></tlLogic>'
+    actuated = (
+        '<tlLogic id="j"><param key="file" value="{}"/><param key="in_0" value="e1"/></tlLogic>'
+    )
     text = f"<all>{WRITERS}{switched}{actuated}<vType id='&lt;ü' maxAccelProfile='1'/></all>"
     given.write_text(text.replace("{}", "a week/results"), encoding="utf-16")
     found = copy_input(given, copy, 0.0)
