@@ -94,6 +94,8 @@ class Trajectories(Environment):
         for file in imported.report["files"]:
             if file["recognised"]:
                 print(f"{file['file']}: recognised {file['recognised']}")
+        for note in imported.report["notes"]:
+            print(f"note: {note}")
         print_seeds(imported.seeds)
         print(f"road: {self.output / ROAD}\nreport: {self.output / REPORT}")
         print_next(self.output / ROAD, imported.seeds, imported.corridor, env, keywords)

@@ -110,13 +110,28 @@ def import_trajectories(
             for seed, (recording, window) in zip(flat, windows, strict=True)
         ]  # fmt: skip
 
+        used, empty = np.zeros(bare.record_shape[1], dtype=bool), list[int]()
+
         def records() -> Iterator[Record]:
             for source_of, (recording, window) in zip(sources, windows, strict=True):
                 record = recording.record(window["window"])
                 source_of |= {"vehicles": len(np.unique(record.vehicle)), "rows": record.n_rows}
+                used[:] |= record.counts.any(axis=0)
+                empty.extend([source_of["seed"]] * (not record.counts[0, : bare.n_mainline].any()))
                 yield record
 
         kept = save_records(folder, bare, records(), sources)
+        notes = [
+            f"no vehicle is ever on the {kind}-ramp at face {face}"
+            for kind, faces, ramps in (
+                ("on", bare.on_ramps, bare.on_ramp_segments),
+                ("off", bare.off_ramps, bare.off_ramp_segments),
+            )
+            for face, segments in zip(faces, ramps, strict=True)
+            if not used[list(segments)].any()
+        ]
+        if empty:
+            notes.append(f"windows begin on an empty mainline: traffic seeds {ranges(empty)}")
 
         def load(seed: int) -> Record:
             return load_record(kept, seed, bare.record_layout)
@@ -126,7 +141,8 @@ def import_trajectories(
         road = dataclasses.replace(measured, recordings=kept)
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
         write_corridor(folder / ROAD, road, environment, comment)
-        report = write_report(folder, road, recordings, seeds, sources, load(flat[0]))
+        first = load(flat[0])
+        report = write_report(folder, road, recordings, seeds, sources, first, notes)
     return Imported(moved(road, output), seeds, report)
 
 

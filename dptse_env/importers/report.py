@@ -53,6 +53,7 @@ _END = {
 def write_report(
     folder: Path, corridor: Corridor, recordings: Sequence[Recording],
     seeds: Mapping[str, tuple[int, ...]], windows: Sequence[Mapping[str, Any]], first: Record,
+    notes: Sequence[str],
 ) -> dict[str, Any]:  # fmt: skip
     """Write the report into a folder.
 
@@ -63,6 +64,7 @@ def write_report(
         seeds: Traffic seeds by split.
         windows: Descriptions of the windows.
         first: The record of the first window, for the picture.
+        notes: What is unusual of the traffic.
 
     Returns:
         What the report says, as plain JSON.
@@ -75,6 +77,7 @@ def write_report(
         "demand": {"mainline": demand.mainline[0][1], "on_ramps": list(demand.on_ramps)},
         "exit_shares": list(corridor.exit_shares),
         "average_dwell": corridor.average_dwell,
+        "notes": list(notes),
         "files": [_file(recording) for recording in recordings],
         "windows": list(windows),
     }
@@ -114,8 +117,9 @@ def _markdown(content: Mapping[str, Any]) -> str:
         f"{exits}, average dwell {content['average_dwell']:g} s.\n\n"
         "![Points, density and speed](report.png)\n"
     )
+    parts += [f"- note: {note}" for note in content["notes"]]
     for file in content["files"]:
-        parts.append(f"## {file['file']}")
+        parts.append(f"\n## {file['file']}")
         if file["recognised"]:
             parts.append(f"\nRecognised, since nobody gave it: {file['recognised']}.")
         for title, told in _COUNTS.items():

@@ -70,7 +70,14 @@ def test_a_mainline_that_nobody_drives_on_is_told(tmp_path):
     lanes = Layout(mainline=Part(lanes=(1,)), on_ramps=(Part(lanes=(7,)),))
     source = Source("table", {**PLAIN.columns, "lane": "lane"}, layout=lanes)
     with pytest.warns(UserWarning, match=r"on the mainline's segments 4 of 4: are layout\.origin"):
-        run(plain(tmp_path / "a.csv", points, lane=np.ones(len(points), dtype=int)), source, ROAD)
+        told = run(
+            plain(tmp_path / "a.csv", points, lane=np.ones(len(points), dtype=int)), source, ROAD
+        )
+    unused = (
+        "no vehicle is ever on the on-ramp at face 1",
+        "no vehicle is ever on the off-ramp at face 3",
+    )
+    assert told.report["notes"] == [*unused]
     (tmp_path / "imported").rename(tmp_path / "first")
     path = plain(tmp_path / "b.csv", points, lane=np.full(len(points), 7))
     with pytest.raises(ValueError, match="files must be with vehicles on the mainline"):
