@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.imported import load_record, ranges, record_path, require_seeds
-from dptse_env.traffic.own_sumo import kind_of
+from dptse_env.traffic.own_sumo import WARNING
 from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
 from dptse_env.traffic.recording import record_seeds
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, sumo_version
@@ -189,14 +189,16 @@ class RecordLibrary:
         sources = {seed: _source(corridor, seed) for seed in seeds}
         about = {"desc": f"recording {corridor.name}", "unit": "seed"}
         with tqdm(total=len(seeds), disable=not progress, **about) as bar:
-            told: dict[str, list[tuple[int, str]]] = {}
-            record_seeds(
-                corridor, paths, sources, workers, bar.update,
-                lambda seed, text: told.setdefault(kind_of(text), []).append((seed, text)),
-            )  # fmt: skip
-        for of_kind in told.values():
-            where = ranges(seed for seed, _ in of_kind)
-            logger.warning("%s, traffic seeds %s: %s", corridor.name, where, of_kind[0][1])
+            told: dict[int, str] = {}
+
+            def remark(seed: int, text: str) -> None:
+                if not text.startswith(WARNING):  # an import has shown these
+                    told[seed] = text
+
+            record_seeds(corridor, paths, sources, workers, bar.update, remark)
+        if told:
+            where, example = ranges(told), next(iter(told.values()))
+            logger.warning("%s, traffic seeds %s: for instance %s", corridor.name, where, example)
 
     @contextlib.contextmanager
     def _explained_errors(self, corridor: Corridor, seeds: list[int]) -> Iterator[None]:

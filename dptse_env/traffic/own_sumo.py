@@ -321,19 +321,15 @@ def tell_departures(libsumo: ModuleType, remark: Remark) -> None:
         remark(f"{loaded - departed} of {loaded} vehicles that SUMO loaded had not departed")
 
 
-def kind_of(text: str) -> str:
-    """Return a message without the names and numbers by which others of its kind differ."""
-    return re.sub(r"'[^']*'|[\d.]+", "", text)
-
-
 def tell_warnings(messages: Path, remark: Remark) -> None:
-    """Tell the most frequent kinds of SUMO's warnings in a file of its messages."""
+    """Tell the most frequent kinds of SUMO's warnings, one of each, in a file of its messages."""
     kinds: dict[str, list[str]] = {}
     for line in messages.read_text(encoding="utf-8", errors="replace").splitlines():
         if line.startswith(WARNING):
-            kinds.setdefault(kind_of(line), []).append(line)
+            kind = re.sub(r"'[^']*'|[\d.]+", "", line)  # without names and numbers
+            kinds.setdefault(kind, []).append(line)
     for lines in sorted(kinds.values(), key=len, reverse=True)[:MOST_KINDS]:
-        remark(f"SUMO warns, {len(lines)} times: {lines[0].removeprefix(WARNING):.300}")
+        remark(f"{lines[0]:.300} ({len(lines)} of this kind)")
 
 
 class VehicleLimits:
@@ -460,7 +456,7 @@ def _without_files(element: ElementTree.Element, found: Copied) -> bool:
         if key.startswith("device.fcd-replay.file"):
             found.read(key, value)
         if _FILE.search(key) or _MEASURES.match(key) or _ELSEWHERE.match(value):
-            found.outputs[key] += 1
+            found.outputs[f"parameter {key}"] += 1
             return False
     for name, value in list(element.attrib.items()):
         if not (name.startswith("{") or _FILE.search(name)):

@@ -17,9 +17,11 @@ from dptse_env.importers.network import Files, find_layout, import_road, read_co
 from dptse_env.traffic import (
     MAINLINE,
     SHORT_HIGHWAY,
+    DemandDistribution,
     Drivers,
     Incident,
     RecordingError,
+    RecordLibrary,
     draw_scenario,
     read_corridor,
     simulate,
@@ -168,6 +170,17 @@ def test_vehicles_out_of_order_depart_and_what_nobody_takes_is_told(files, tmp_p
     assert {f"no vehicle leaves {how}" for how in ("at the downstream end", "by exit-a")} <= {
         *mixed.remarks
     }
+
+
+def test_vehicles_that_do_not_depart_are_told_when_they_are_recorded(road, tmp_path, caplog):
+    crowded = DemandDistribution(road.corridor.published_demand, (6.0, 6.0))
+    corridor = dataclasses.replace(road.corridor, demand=crowded, duration=60)
+    RecordLibrary(tmp_path).ensure(corridor, [0, 1])
+    (message,) = caplog.messages
+    assert re.fullmatch(
+        r"motorway, traffic seeds 0\.\.1: for instance \d+ of \d+ vehicles that .* not departed",
+        message,
+    )
 
 
 LOCAL = """
@@ -393,7 +406,7 @@ def test_a_copy_for_sumo_names_no_file_and_keeps_all_else(tmp_path):
     text = f"<all>{WRITERS}{switched}{actuated}<vType id='&lt;ü' maxAccelProfile='1'/></all>"
     given.write_text(text.replace("{}", "a week/results"), encoding="utf-16")
     found = copy_input(given, copy, 0.0)
-    assert found.outputs["timedEvent"] == found.outputs["file"] == 1
+    assert found.outputs["timedEvent"] == found.outputs["parameter file"] == 1
     expected = re.sub(r'output="{}" |<param key="file" value="{}"/>', "", text).replace("{}", "NUL")
     assert canonicalize(copy.read_text()) == canonicalize(expected)
 
