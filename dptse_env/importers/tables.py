@@ -47,6 +47,12 @@ LONGEST_DOCUMENT = 16 << 20
 HEAD = 1 << 16
 """Bytes at the start of a text file by which its delimiter and columns are told."""
 PARQUET = (".parquet", ".pq")
+MISSING = ("", "nan", "null", "none", "<na>")
+"""Texts of a label that is missing, in lower case."""
+CODES = ("lane", "group")
+"""Roles of labels that are codes: those that are one number are one, as 3, 03 and 3.0."""
+LARGEST_CODE = 2.0**53
+"""Numbers below it are exact."""
 ROW = "row of the file"
 """Name of the column of row numbers beside the file's own columns."""
 
@@ -114,8 +120,7 @@ def scan(path: Path, form: Format, source: Source) -> Points:
     columns: dict[str, Any] = {"row": pl.col(ROW).cast(pl.Int64)}
     for role, name in roles.items():
         if role in LABELS:
-            text = _label(kinds[name], name)
-            columns[role] = pl.when(text != "").then(text)  # an empty name is no name
+            columns[role] = _label(kinds[name], name, role)
             continue
         if not (kinds[name].is_numeric() or kinds[name] in (pl.String, pl.Null)):
             raise TrajectoryError(
@@ -128,6 +133,12 @@ def scan(path: Path, form: Format, source: Source) -> Points:
         found = _find(path, name, names, "source.where")
         # Rows without a vehicle tell times alone.
         raw = raw.filter(columns["vehicle"].is_null() | _equals(found, value))
+    layout, lane = source.layout, columns.get("lane")
+    wanted = [part.names for part in (layout.mainline, *layout.on_ramps, *layout.off_ramps)]
+    names_of_lanes = sorted(frozenset().union(*wanted))
+    for name, code in zip(names_of_lanes, codes(names_of_lanes), strict=True):
+        if lane is not None and code != name:  # as the layout spells it, "01"
+            columns["lane"] = pl.when(lane == code).then(pl.lit(name)).otherwise(columns["lane"])
     absent = {name: pl.lit(None, kind) for name, kind in SCHEMA.items() if name not in columns}
     # What is no finite number is named, for the first error.
     numbers = [role for role in NUMBERS if role in roles]
@@ -263,12 +274,24 @@ def _number(kind: Any, name: str, grouped: bool) -> pl.Expr:
     return column.cast(pl.Float64, strict=False)
 
 
-def _label(kind: Any, name: str) -> pl.Expr:
-    column = pl.col(name)
-    if kind.is_float():  # 3.0 is the name 3
-        whole = pl.when(column == column.round()).then(column).cast(pl.Int64, strict=False)
-        return pl.coalesce(whole.cast(pl.String), column.cast(pl.String))
-    return column.cast(pl.String)
+def _label(kind: Any, name: str, role: str) -> pl.Expr:
+    text = pl.col(name).cast(pl.String).str.strip_chars()
+    label = _code(text) if kind.is_float() or role in CODES else text
+    return pl.when(text.str.to_lowercase().is_in(MISSING).not_()).then(label)
+
+
+def _code(text: pl.Expr) -> pl.Expr:
+    """Return the shortest text of a code that is a number, and others as they are."""
+    number = text.cast(pl.Float64, strict=False)
+    whole = pl.when(number == number.round()).then(number).cast(pl.Int64, strict=False)
+    code = pl.coalesce(whole.cast(pl.String), number.cast(pl.String))
+    return pl.when(number.abs() < LARGEST_CODE).then(code).otherwise(text)
+
+
+def codes(values: Iterable[object]) -> list[str]:
+    """Return values as the codes that a table of points has for them."""
+    texts = pl.Series(map(str, values), dtype=pl.String).str.strip_chars()
+    return texts.to_frame("text").select(_code(pl.col("text")))["text"].to_list()
 
 
 def _roles(path: Path, form: Format, source: Source, found: list[str]) -> dict[str, str]:
@@ -294,13 +317,14 @@ def _roles(path: Path, form: Format, source: Source, found: list[str]) -> dict[s
 
 
 def _find(path: Path, name: str, found: Iterable[str], option: str) -> str:
-    by_name = {_normal(each): each for each in found}
-    if _normal(name) not in by_name:
+    fits = [each for each in found if _normal(each) == _normal(name)]
+    fits = [each for each in fits if each == name] or fits
+    if len(fits) != 1:
         raise TrajectoryError(
             f"{path}: {option} must be a column of the file, got {shown(name)}; found "
-            f"{shown([*found])}"
+            f"{shown(fits or [*found])}"
         )
-    return by_name[_normal(name)]
+    return fits[0]
 
 
 def _normal(name: str) -> str:
@@ -309,10 +333,8 @@ def _normal(name: str) -> str:
 
 def _equals(name: str, value: object) -> pl.Expr:
     """Return whether a column has a value, or one of several, as text or as a number."""
-    texts = [str(each) for each in (value if isinstance(value, list | tuple) else [value])]
-    numbers = pl.Series(texts).cast(pl.Float64, strict=False).drop_nulls()
-    text = pl.col(name).cast(pl.String)
-    return text.is_in(texts) | text.cast(pl.Float64, strict=False).is_in(numbers.implode())
+    wanted = codes(value if isinstance(value, list | tuple) else [value])
+    return _code(pl.col(name).cast(pl.String).str.strip_chars()).is_in(wanted)
 
 
 # -- XML and JSON ----------------------------------------------------------------------------------

@@ -216,6 +216,14 @@ def test_tables_may_be_parquet_compressed_or_by_other_delimiters(tmp_path, expec
         np.testing.assert_array_equal(counts(imported), expected, name)
 
 
+def test_a_column_is_that_of_its_own_spelling(tmp_path, expected):
+    path = plain(tmp_path / "a.csv", stream(), S=0.0 * stream()[:, 2])
+    fold = dataclasses.replace(PLAIN, columns={**PLAIN.columns, "x": "s "})
+    with pytest.raises(TrajectoryError, match=r"columns\.x must be .* 's '; found \['s', 'S'\]"):
+        run(path, fold)
+    np.testing.assert_array_equal(counts(run(path)), expected)
+
+
 LONG = "x" * 100_000
 DOCUMENT = i24(stream())[0]
 BAD = {
