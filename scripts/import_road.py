@@ -30,7 +30,7 @@ from dptse_env.importers.network import (
     import_road,
     read_configuration,
 )
-from dptse_env.importers.report import REPORT
+from dptse_env.importers.report import REPORT, remarks
 from dptse_env.traffic import Corridor, is_road_file, ranges, read_road, write_corridor
 from dptse_env.utils.files import replacing
 from scripts.cli import Environment
@@ -92,8 +92,8 @@ class Trajectories(Environment):
             {key: value for key, value in environment.items() if key != "traffic_seeds"},
         )
         for file in imported.report["files"]:
-            if file["recognised"]:
-                print(f"{file['file']}: recognised {file['recognised']}")
+            for remark in remarks(file):
+                print(f"{file['file']}: {remark}")
         for note in imported.report["notes"]:
             print(f"note: {note}")
         print_seeds(imported.seeds)

@@ -16,7 +16,14 @@ import polars as pl
 
 from dptse_env.importers import tables, units
 from dptse_env.importers.placing import OFF, Road, part_in_words, placed
-from dptse_env.importers.resampling import TIME_UNIT, check_pieces, count_ends, whole_seconds
+from dptse_env.importers.resampling import (
+    TIME_UNIT,
+    check_pieces,
+    count_ends,
+    step_back,
+    stretches,
+    whole_seconds,
+)
 from dptse_env.importers.source import Source, TrajectoryError
 from dptse_env.traffic.record import Record
 from dptse_env.utils.fields import cut, inside, integer, non_negative, shown
@@ -28,6 +35,8 @@ MOST_WAITING = 1_000_000
 """Points of all buckets together that wait in memory to be written."""
 LONGEST_SILENCE = 600.0
 """Time without any row [s] after which a file is another recording, with windows of its own."""
+LONGEST_PAUSE = 30.0
+"""Time without any row [s] from which on it is told that the road counts as empty."""
 MOST_WINDOWS = 100_000
 """Windows of a file at most; wrong times would otherwise ask for millions."""
 LARGEST_NUMBER = 10_000
@@ -106,7 +115,9 @@ class Recording:
         seconds = self._seconds_of_file()
         self.shift = self._time_shift(seconds)
         coverage = self._cut(seconds)
+        self._stretches: list[pl.DataFrame] = []
         pieces = pl.concat([self._take(bucket, coverage) for bucket in range(n_buckets)])
+        self._require_one_clock()
         self._require_joined()
         self.speed_ratio = check_pieces(pieces, str(self.path), self._units)
 
@@ -202,7 +213,7 @@ class Recording:
             )
             .collect(engine="streaming")
         )  # fmt: skip
-        wanted = c("group").is_in(list(map(str, self.source.groups)) or seconds["group"].implode())
+        wanted = c("group").is_in(tables.codes(self.source.groups) or seconds["group"].implode())
         if seconds["rows"].sum() == 0:
             chosen = " that source.where chooses" if self.source.where else ""
             raise TrajectoryError(f"{self.path}: it must have rows of vehicles{chosen}, got none")
@@ -211,7 +222,8 @@ class Recording:
                 f"{self.path}: source.groups must be in the file, got {shown(self.source.groups)}"
             )
         self.counts["rows"] = int(seconds["rows"].sum())
-        self.counts["no_vehicle"] = int(seconds["no_vehicle"].sum())
+        if not self._form.sumo:  # whose rows without a vehicle tell times
+            self.counts["no_vehicle"] = int(seconds["no_vehicle"].sum())
         self.counts["other_group"] = int(seconds.filter(~wanted)["rows"].sum())
         seconds = seconds.filter(wanted)
         for name in ("off_lanes", "off_ends"):
@@ -250,6 +262,18 @@ class Recording:
             )
         return float(times[1] - times[0])
 
+    def _require_one_clock(self) -> None:
+        """Refuse a file that is sorted by time and whose time steps back over other vehicles."""
+        step = step_back(pl.concat(self._stretches))
+        if step is not None:
+            row, *times = step
+            before, at = (f"{time + self.base - self.shift:.10g} s" for time in times)
+            raise TrajectoryError(
+                f"{self.path}, row {row}: the time must not step back into the traffic before, got "
+                f"{at} after {before}: put the rows from here on into a file of their own if the "
+                "clock was set back or another recording begins, and else sort the rows by time"
+            )
+
     def _require_joined(self) -> None:
         """Refuse a file in which points are mostly too far apart to be trajectories."""
         cut, followed = self.counts["gaps_cut"] + self.counts["jumps_cut"], self.counts["followed"]
@@ -267,11 +291,15 @@ class Recording:
         A silence parts a group into recordings. Those that are shorter than a window have none.
         """
         c, stride = pl.col, self.road.corridor.duration + 1 + self.options.pause
+        wait = c("begin") - c("end").shift()
+        pauses = wait.is_between(LONGEST_PAUSE, LONGEST_SILENCE).over("group")
         part = (c("second").diff() > LONGEST_SILENCE).fill_null(False).cum_sum().over("group")
         # A simulation that begins at 0 begins with an empty road.
         empty = self._form.sumo and seconds["begin"].min() == 0.0
+        seconds = seconds.sort("group", "second")
+        self.counts["pauses"] = seconds.select(pauses.sum()).item()
         parts = (
-            seconds.sort("group", "second")
+            seconds
             .with_columns(part=part)
             .group_by("group", "part")
             .agg(c("begin").min(), c("end").max() + self.shift, c("rows").sum(), c("row").min())
@@ -345,8 +373,11 @@ class Recording:
         label = c("vehicle").first()
         whole = pl.when(label.str.contains(r"^\d{1,8}$")).then(label).cast(pl.Int64).fill_null(-1)
         labels = points.group_by("id").agg(name=whole)
-        points = points.drop("vehicle", "off", "bad")
-        found, pieces = whole_seconds(points, self.road, self.options.longest_gap, self.counts)
+        points = points.drop("off", "bad")
+        self._stretches.append(stretches(points, self.options.longest_gap))
+        found, pieces = whole_seconds(
+            points, self.road, self.options.longest_gap, self.counts, str(self.path)
+        )
         self.counts.update(count_ends(pieces, coverage, self.road))
         since = (c("second") - c("first")).alias("step")
         found = (

@@ -18,11 +18,13 @@ REPORT = "report.md"
 _COUNTS = {
     "rows": {
         "rows": "rows of vehicles",
+        "no_vehicle": "other rows, dropped: without a vehicle's id",
         "other_group": "dropped: of another group than chosen",
         "off_lanes": "dropped: on other lanes, lateral positions or edges than the road's",
         "off_ends": "dropped: before the road's start or beyond its end",
         "far_away": "dropped: ten minutes or more from all windows; are these times right?",
         "duplicates": "dropped: duplicates of another row",
+        "pauses": "times of half a minute or more without a row: the road counts as empty there",
         "out_of_order": "out of order in time, sorted",
         "seconds": "vehicles at whole seconds, from the others",
         "negative_speeds": "of these with a speed below 0, set to 0",
@@ -38,6 +40,7 @@ _COUNTS = {
         "too_short": "trajectories without a whole second, dropped",
     },
 }
+_ORDINARY = ("rows", "seconds", "vehicles", "pieces", "gaps_filled", "seconds_filled")
 _BEGIN = {
     "present_at_start": "are there at the start of the file",
     "entered": "begin at an entry",
@@ -87,8 +90,16 @@ def write_report(
     return content
 
 
+def remarks(file: Mapping[str, Any]) -> list[str]:
+    """Return what a user should know of a file of a report, in a line each."""
+    known = [f"recognised {file['recognised']}"] if file["recognised"] else []
+    told = {key: words for table in _COUNTS.values() for key, words in table.items()}
+    rare = [key for key in told if key not in _ORDINARY and file[key]]
+    return known + [f"{file[key]} {told[key]}" for key in rare]
+
+
 def _file(recording: Recording) -> dict[str, Any]:
-    names = (*_COUNTS["rows"], *_COUNTS["trajectories"], *_BEGIN, *_END, "no_vehicle")
+    names = (*_COUNTS["rows"], *_COUNTS["trajectories"], *_BEGIN, *_END)
     ratio = recording.speed_ratio
     return {
         "file": recording.path.name,

@@ -13,6 +13,7 @@ from dptse_env.importers.placing import Road
 from dptse_env.importers.source import LENGTHS, SPEEDS, TrajectoryError
 from dptse_env.importers.units import FASTEST_ROAD, SLOWEST_ROAD, TOLERANCE
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.fields import shown
 
 TIME_UNIT = 1e-4
 """Times are rounded to this [s]: sums of frame lengths are not whole in floating point."""
@@ -22,23 +23,30 @@ JUMP = 0.05
 """Distance that noise may add, forwards or backwards [km]."""
 SAME_PLACE = 0.005
 """Largest distance between two points that count as duplicates [km]."""
+MOST_SHARING = 20
+"""Vehicles that may share an id at one time."""
 HALF_WIDTH = 0.5
 """A derived speed is the mean over this time [s] on both sides."""
 
 
 def whole_seconds(
-    points: pl.DataFrame, road: Road, longest_gap: float, counts: Counter[str]
+    points: pl.DataFrame, road: Road, longest_gap: float, counts: Counter[str], where: str
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Return vehicles at whole seconds, and a row for each piece of a trajectory.
 
     Args:
-        points: All points on the road of some vehicles: row, id (whole numbers), time [s],
-            position [km], speed [km/h] (null to derive it), branch, column, lane_number, group.
+        points: All points on the road of some vehicles: row, id (whole numbers), vehicle (the
+            file's name for it), time [s], position [km], speed [km/h] (null to derive it), branch,
+            column, lane_number, group.
         road: The road that they are on.
         longest_gap: Longest time without points that is filled by interpolation [s].
         counts: What happens is added to it.
+        where: The file, for messages.
+
+    Raises:
+        TrajectoryError: Many vehicles share an id at one time.
     """
-    points = _in_order(points, longest_gap, counts)
+    points = _in_order(points, longest_gap, counts, where)
     c, following = pl.col, pl.all().shift(-1)
     same = (c("id") == c("next_id")).fill_null(False)
     wait, move = c("next_time") - c("time"), c("next_position") - c("position")
@@ -113,7 +121,9 @@ def _between(name: str) -> pl.Expr:
     return pl.when(pl.col("share") > 0.0).then(at + pl.col("share") * (after - at)).otherwise(at)
 
 
-def _in_order(points: pl.DataFrame, longest_gap: float, counts: Counter[str]) -> pl.DataFrame:
+def _in_order(
+    points: pl.DataFrame, longest_gap: float, counts: Counter[str], where: str
+) -> pl.DataFrame:
     """Return points by vehicle and time without duplicates, with the track of each.
 
     A vehicle that is in two places at once is several vehicles that share an id: each is a track.
@@ -142,16 +152,16 @@ def _in_order(points: pl.DataFrame, longest_gap: float, counts: Counter[str]) ->
         kept = points.filter(c("id").is_in(ambiguous.implode()).not_())
         several = points.filter(c("id").is_in(ambiguous.implode()))
         vehicles = several.partition_by("id", maintain_order=True)
-        tracks = [_tracks(each, longest_gap) for each in vehicles]
+        tracks = [_tracks(each, longest_gap, where) for each in vehicles]
         counts["ids_shared"] += len(tracks)
         counts["duplicates"] += sum(int((each < 0).sum()) for each in tracks)
         several = several.with_columns(track=pl.Series(np.concatenate(tracks), dtype=pl.Int32))
         points = pl.concat([kept, several.filter(c("track") >= 0)], how="vertical_relaxed")
         points = points.sort("id", "track", "time")
-    return points.drop("twice", "near", "there", "back")
+    return points.drop("twice", "near", "there", "back", "vehicle")
 
 
-def _tracks(points: pl.DataFrame, longest_gap: float) -> IntArray:
+def _tracks(points: pl.DataFrame, longest_gap: float, where: str) -> IntArray:
     """Return which of the vehicles that share an id each point belongs to; -1 for a duplicate.
 
     Points are taken in order of time. Each goes on with the track that would be nearest at its
@@ -179,10 +189,79 @@ def _tracks(points: pl.DataFrame, longest_gap: float) -> IntArray:
         if best == n:
             ends[n] = time, position, lane, 0.0
             n += 1
+            if len(ends) > MOST_SHARING:
+                raise TrajectoryError(
+                    f"{where}, row {points['row'][i]}: an id must be that of a vehicle, got "
+                    f"{shown(points['vehicle'][i])} at over {MOST_SHARING} places within "
+                    f"{longest_gap:g} s: is the column of the vehicle right?"
+                )
         elif best >= 0:
             t, p, _, _ = ends[best]
             ends[best] = time, position, lane, (position - p) / (time - t)
     return found
+
+
+def stretches(points: pl.DataFrame, longest_gap: float) -> pl.DataFrame:
+    """Return the stretches of a vehicle's points that go on in time, in the order of the file.
+
+    Args:
+        points: Points of some vehicles, as for `whole_seconds`.
+        longest_gap: Longest time between two points of a stretch [s].
+
+    Returns:
+        Group, first and last row, begin and end [s] and number of points of each; none where points
+        are mostly in no order.
+    """
+    c = pl.col
+    kept = points.unique(["id", "time", "position", "lane_number"], keep="first")
+    wait = c("time").diff()
+    follows = (c("id").diff() == 0) & (wait >= 0.0) & (wait <= longest_gap)
+    found = (
+        kept.sort("id", "row", "time")
+        .group_by(stretch=follows.fill_null(False).not_().cum_sum())
+        .agg(c("group").first(), first=c("row").first(), last=c("row").last(),
+             begin=c("time").first(), end=c("time").last(), n=pl.len())
+        .drop("stretch")
+    )  # fmt: skip
+    return found if 2 * len(found) <= len(kept) else found.clear()
+
+
+def step_back(found: pl.DataFrame) -> tuple[int, float, float] | None:
+    """Return where the time of a file that is sorted by time steps back into traffic before.
+
+    Such a file has several recordings, or its clock was set back. A file that is sorted by vehicle
+    has none: there, the rows of vehicles that are on the road at one time do not alternate.
+
+    Args:
+        found: All its `stretches`.
+
+    Returns:
+        The row, and the times before and at it [s].
+    """
+    c = pl.col
+    found = found.sort("group", "first")
+    lasting = found.filter(c("n") > 1)
+    frame = lasting.select(((c("end") - c("begin")) / (c("n") - 1)).median()).item() or 0.0
+
+    def before(expr: pl.Expr) -> pl.Expr:
+        return expr.shift().over("group")
+
+    together = (c("begin") < before(c("end")) - frame) & (before(c("begin")) < c("end") - frame)
+    alternate = c("first") < before(c("last"))
+    by_time = found.select((together & alternate).sum() > (together & ~alternate).sum()).item()
+    # Blocks of rows that no vehicle's stretch connects.
+    block = (c("first") > before(c("last").cum_max())).fill_null(False).cum_sum()
+    blocks = (
+        found.with_columns(block=block)
+        .group_by("group", "block")
+        .agg(c("first").min(), c("begin").min(), c("end").max())
+    )
+    overlap = c("begin") < before(c("end").cum_max()) - 1.01 * frame
+    if not by_time or not blocks.sort("group", "begin").select(overlap.any()).item():
+        return None
+    back = c("begin") < c("before") - 1.01 * frame
+    steps = blocks.sort("group", "first").with_columns(before=before(c("end"))).filter(back)
+    return steps.sort("first").select("first", "before", "begin").row(0)
 
 
 def _derived(points: pl.DataFrame, place: IntArray, second: IntArray) -> FloatArray:

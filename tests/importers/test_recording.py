@@ -8,6 +8,7 @@ import polars as pl
 import pytest
 
 from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError, recording
+from dptse_env.importers.report import remarks
 from dptse_env.traffic import RecordLibrary
 from tests.importers.data import PLAIN, ROAD, first_file, plain, run, stream, write_csv
 
@@ -85,6 +86,92 @@ def test_a_silence_of_over_ten_minutes_begins_another_recording(tmp_path):
         )
         vehicles = record_of(imported, 2 + seed).vehicle
         assert set(vehicles) == {100 + vehicle for vehicle in record_of(alone, seed).vehicle}
+
+
+jitter = np.random.default_rng(0).random
+
+
+def by_time(points):
+    return points[np.lexsort((points[:, 0], points[:, 1]))]
+
+
+@pytest.mark.parametrize(
+    ("back", "again", "keep"),
+    [
+        (0.4, 0, 1),  # a correction of four frames
+        (30.0, 0, 1),
+        (60.0, 100, 1),  # another recording, whose clock begins anew
+        (30.0, 0, 4),  # rarely two vehicles on the road
+    ],
+)
+def test_a_time_that_steps_back_into_traffic_is_refused(back, again, keep, tmp_path):
+    points = by_time(stream())
+    points = points[points[:, 0] % keep == 0]
+    late = points[:, 1] > 59.95
+    row, at = 2 + late.argmax(), points[late.argmax(), 1] - back
+    points[late] += [again, -back, 0, 0]
+    message = (
+        rf"a\.csv, row {row}: the time must not step back .*, got {at:.10g} s after [\d.]+ s: "
+    )
+    with pytest.raises(TrajectoryError, match=message):
+        run(plain(tmp_path / "a.csv", points))
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        by_time,
+        lambda points: points[::-1],
+        lambda points: np.random.default_rng(0).permutation(points),
+        lambda points: points[np.argsort(points[:, 1] + 0.1 * jitter(len(points)))],
+        lambda points: np.roll(by_time(points), len(points) // 2, axis=0),
+        lambda points: np.concatenate([by_time(points), by_time(points)]),
+        lambda points: np.concatenate([points[300:650], points[:300], points[650:]]),
+    ],
+    ids=["time", "back", "none", "within a frame", "halves", "twice", "pages of vehicles"],
+)
+def test_rows_may_be_in_any_order_of_one_traffic(order, tmp_path):
+    points = stream()
+    expected = record_of(run(plain(tmp_path / "a.csv", points)), 1)
+    record = record_of(run(plain(subfolder(tmp_path, "b"), order(points))), 1)
+    np.testing.assert_array_equal(record.counts, expected.counts)
+    np.testing.assert_allclose(record.speed_sums, expected.speed_sums)
+
+
+def test_one_id_for_all_vehicles_is_told_before_speeds_are_judged(tmp_path):
+    points = stream(headway=0.8) * [0, 1, 1, 1] + [7, 0, 0, 0]
+    message = r"a\.csv, row \d+: an id must be that of a vehicle, got '7' at over 20 places"
+    with pytest.raises(TrajectoryError, match=message):
+        run(plain(tmp_path / "a.csv", points))
+
+
+@pytest.mark.parametrize("text", ["{}.0", " {} ", "0{}", "{}.000e+00"])
+def test_codes_that_are_one_number_are_one(text, tmp_path):
+    points = stream()
+    counts = []
+    for name, write, wanted in (("a", "{}", (1, 7)), ("b", text, (1, 7)), ("c", text, ("01", 7))):
+        codes = [write.format(1 + int(vehicle) % 2) for vehicle in points[:, 0]]
+        source = dataclasses.replace(
+            PLAIN, columns={**PLAIN.columns, "lane": "lane", "group": "side"}, where={"site": 1},
+            groups=(1,), layout=Layout(mainline=Part(lanes=wanted)),
+        )  # fmt: skip
+        path = plain(subfolder(tmp_path, name), points, lane=codes, side=codes, site=codes)
+        counts.append(record_of(run(path, source)).counts)
+    assert counts[0].any()
+    np.testing.assert_array_equal(counts[0], counts[1])
+    np.testing.assert_array_equal(counts[0], counts[2])
+
+
+def test_what_is_left_out_is_told(tmp_path):
+    points = by_time(stream())
+    paused = points[(points[:, 1] < 50.0) | (points[:, 1] > 90.0)]
+    names = ["nan" if i < 3 else int(vehicle) for i, vehicle in enumerate(paused[:, 0])]
+    lanes = np.where(paused[:, 0] == 5, 9, 1)
+    source = dataclasses.replace(WITH_LANES, layout=Layout(mainline=Part(lanes=(1,))))
+    told = remarks(first_file(run(plain(tmp_path / "a.csv", paused, id=names, lane=lanes), source)))
+    assert told[0] == "3 other rows, dropped: without a vehicle's id"
+    assert told[1].startswith(f"{(lanes == 9).sum()} dropped: on other lanes")
+    assert told[2].startswith("1 times of half a minute or more without a row")
 
 
 @pytest.mark.filterwarnings("ignore:no vehicle is on the mainline")
