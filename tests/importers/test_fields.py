@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
+from dptse_env.importers.fields import UNITS, FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import Split
 from dptse_env.traffic import RecordLibrary, find_corridor
 
@@ -125,15 +125,10 @@ def test_fields_of_no_use_are_refused_and_leave_nothing(changes, road, duration,
     ("changes", "message"),
     [
         (
-            {"density_unit": "veh/km"},
+            {"density_unit": None},
             r"density\.txt: density_unit .* likely veh/ft or veh/m, got 'veh/km'",
         ),
-        ({"speed": None, "flow_unit": "veh/min"}, r"flow\.txt: flow_unit .* likely veh/s, got"),
-        ({"speed": None, "flow_unit": "veh/h"}, r"flow\.txt: flow_unit .* likely veh/s, got"),
-        (
-            {"speed_unit": "m/s"},
-            r"speed\.txt: .* likely km/h or ft/s .* 100 % of speeds are above 2",
-        ),
+        ({"speed": None}, r"flow\.txt: flow_unit .* likely veh/s, got 'veh/h'.* given is kept"),
     ],
 )
 def test_forgotten_units_are_refused_with_the_likely_one(changes, message, tmp_path):
@@ -142,8 +137,27 @@ def test_forgotten_units_are_refused_with_the_likely_one(changes, message, tmp_p
         write(tmp_path, **changes, **flow).read(4, 110.0)
 
 
+@pytest.mark.parametrize(
+    ("kind", "unit", "problem"),
+    [
+        ("density", "veh/km", r"no density is above"),
+        ("speed", "m/s", r"100 % of speeds are above 200 km/h"),
+        ("flow", "veh/min", r"no speed is above"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:no speed of the field is above")
+def test_a_unit_that_is_given_is_kept_and_what_is_odd_is_told(kind, unit, problem, tmp_path):
+    changes = {"speed": None, "flow": tmp_path / "flow.txt"} if kind == "flow" else {}
+    source = write(tmp_path, **changes, **{f"{kind}_unit": unit})
+    with pytest.warns(UserWarning, match=rf"{kind}\.txt: is {kind}_unit {unit} right.* {problem}"):
+        density, flow = source.read(100, 110.0)
+    table = UNITS[kind][unit] * np.loadtxt(tmp_path / f"{kind}.txt")
+    got = {"density": density, "flow": flow, "speed": flow / density}[kind]
+    np.testing.assert_allclose(got, table)
+
+
 def test_speeds_in_metres_a_second_are_told_in_light_traffic_alone(tmp_path):
-    source = write(tmp_path, speed_unit="km/h")
+    source = write(tmp_path, speed_unit=None)
     np.savetxt(tmp_path / "speed.txt", np.full((10, 90), 29.0))
     allowed = r"likely m/s or mi/h, got 'km/h': speeds are 29 km/h in light traffic, at a limit"
     with pytest.raises(ValueError, match=rf"speed\.txt: speed_unit must be .*{allowed} of 110"):
@@ -156,17 +170,18 @@ def test_speeds_in_metres_a_second_are_told_in_light_traffic_alone(tmp_path):
 @pytest.mark.parametrize(
     ("name", "usual", "odd", "message"),
     [
-        ("speed", 60.0, 300.0, r"likely none that is known, .*: 1 % of speeds are above 200"),
+        ("speed", 66.0, 330.0, r"likely none that is known, .*: 1 % of speeds are above 200"),
         (
             "density",
-            0.02,
-            0.3,
-            r"likely veh/m, .*: 1 % of cells are above 800 v",
+            66.0,
+            984.0,
+            r"likely veh/mi, .*: 1 % of cells are above 800 v",
         ),
     ],
 )
 def test_a_few_cells_may_be_odd(name, usual, odd, message, tmp_path):
     source, table = write(tmp_path), np.full((10, 90), usual)
+    source = dataclasses.replace(source, **{f"{name}_unit": None})
     table.flat[:9] = odd  # 1 % of the cells
     np.savetxt(tmp_path / f"{name}.txt", table)
     assert source.read(4, 110.0)[0].shape == (10, 90)
@@ -229,6 +244,101 @@ def test_short_gaps_are_filled_and_told_and_long_ones_refused(tmp_path):
         ValueError, match=r"density\.txt: column 6 must have values, got none: leave"
     ):
         turned.read(4, 110.0)
+
+
+def traffic(cells=12, intervals=60):
+    """Density [veh/km] and speed [km/h] of 100 m and 5 s each: waves upstream, at 18 km/h."""
+    place, time = 0.1 * np.arange(cells)[:, None], 5.0 / 3600.0 * np.arange(intervals)[None]
+    rng = np.random.default_rng(0)
+    waves = sum(np.sin(400.0 * u * (time + place / 18.0) + 7.0 * p) for u, p in rng.random((8, 2)))
+    density = 180.0 + 12.0 * waves
+    return density, 18.0 * (450.0 / density - 1.0)
+
+
+def save(folder, delimiter=" ", **tables):
+    """Write tables, and return the field of them."""
+    for name, table in tables.items():
+        np.savetxt(folder / f"{name}.txt", table, delimiter=delimiter, fmt="%.6g")
+    paths = {name: folder / f"{name}.txt" for name in tables}
+    return FieldSource(**paths, cell=0.1, interval=5.0, delimiter=delimiter.strip() or None)
+
+
+def test_zeros_while_detectors_were_off_are_gaps(tmp_path):
+    density, speed = traffic()
+    expected = save(tmp_path, density=density, speed=speed).read(3, 100.0)[0]
+    density[:, 20:23] = speed[:, 20:23] = 0.0  # all
+    with pytest.warns(UserWarning, match=r"off in column\(s\) 21\.\.23, .*tell: 36 of 720 cells"):
+        found, flow = save(tmp_path, density=density, speed=speed).read(3, 100.0)
+    np.testing.assert_allclose(
+        np.delete(found, slice(20, 23), 1), np.delete(expected, slice(20, 23), 1)
+    )
+    assert found.min() > 50.0
+    assert flow.min() > 500.0
+    density[4, 30:50] = speed[4, 30:50] = 0.0  # one, for 100 s
+    message = (
+        r"row 5 must have a value every 60 s, got none from column 31 to 50 but zeros, as of det"
+    )
+    with pytest.raises(ValueError, match=message):
+        save(tmp_path, density=density, speed=speed).read(3, 100.0)
+    density[4] = speed[4] = 0.0
+    with pytest.raises(
+        ValueError, match=r"density\.txt: row 5 must have values, got none but zeros"
+    ):
+        save(tmp_path, density=density, speed=speed).read(3, 100.0)
+
+
+@pytest.mark.parametrize("empty", [np.nan, 100.0])
+def test_a_road_may_be_empty_for_minutes(empty, tmp_path):
+    density, speed = traffic()
+    density[:, 20:50], speed[:, 20:50] = 0.0, empty
+    density[:6, :15] = speed[:6, :15] = 0.0  # before the first vehicles arrive
+    density[6:, :15], speed[6:, :15] = 0.0, empty
+    found, flow = save(tmp_path, density=density, speed=speed).read(3, 100.0)
+    np.testing.assert_allclose(found, density, rtol=1e-5)
+    assert not flow[:, 20:50].any()
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "got"),
+    [
+        (True, False, r"row 1 must be values, got a header or an index, 1, 2, 3"),
+        (False, True, r"column 1 must be values, got a header or an index, 0\.1, 0\.2, 0\.3"),
+        (True, True, r"row 1 must be values"),
+    ],
+)
+def test_headers_and_index_columns_are_named(rows, columns, got, tmp_path):
+    tables = {}
+    for name, values in zip(("density", "speed"), traffic(), strict=True):
+        header, index = np.arange(60.0), 0.1 * np.arange(12.0)[:, None]
+        table = np.hstack([index, values]) if columns else values
+        header = np.concatenate([[np.nan], header]) if columns else header
+        tables[name] = np.vstack([header, table]) if rows else table
+    with pytest.raises(ValueError, match=rf"density\.txt: {got}, \.\.\.: leave it out|{got}"):
+        save(tmp_path, ",", **tables).read(3, 100.0)
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_a_field_whose_rows_are_intervals_is_told(is_turned, tmp_path):
+    density, speed = traffic()
+    for name, turned in (("right", is_turned), ("wrong", not is_turned)):
+        tables = (
+            {"density": density.T, "speed": speed.T}
+            if turned
+            else {"density": density, "speed": speed}
+        )
+        source = dataclasses.replace(save(tmp_path, **tables), transposed=is_turned)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            source.read(3, 100.0)
+        assert any("transposed" in str(each.message) for each in told) == (name == "wrong")
+    with (
+        pytest.warns(UserWarning, match="transposed"),
+        pytest.raises(ValueError, match=r"below the field's 60 s, or transposed given, got 100"),
+    ):
+        import_field(
+            dataclasses.replace(save(tmp_path, density=density.T, speed=speed.T)),
+            FieldRoad("a", segments=3, lanes=3, speed_limit=100.0), tmp_path / "road", SPLITS, 100,
+        )  # fmt: skip
 
 
 def test_a_folder_is_never_replaced(tmp_path):
