@@ -59,9 +59,6 @@ FEW = 0.01
 """Share of the cells that may be beyond these limits, by noise; more tell of another unit."""
 SLOW = 0.4
 """Share of the limit that vehicles exceed where they drive freely."""
-WAVE, WAVE_LENGTH = 18.0, 0.1
-"""Speed [km/h] at which waves of congested traffic run upstream, and the way [km] by which it is
-told that they do."""
 BLOCK_TIME = 10.0
 """Time [s] over which it is told whether vehicles that enter stay or leave."""
 SURE, SURER = 0.65, 0.15
@@ -127,9 +124,9 @@ class FieldSource:
             OSError: A file cannot be read.
 
         Warns:
-            UserWarning: Gaps were filled; queues move downstream; rows seem to be intervals; data
-                are odd in the unit that is given, or all speeds are low, which congestion may
-                explain, or another unit.
+            UserWarning: Gaps were filled; vehicles are conserved only if rows are intervals or
+                cells in the other order; data are odd in the unit that is given, or all speeds are
+                low, which congestion may explain, or another unit.
         """
         number(float, self.cell, "cell", Interval(0.001, 10))
         number(float, self.interval, "interval", Interval(0.01, 3600))
@@ -171,8 +168,6 @@ class FieldSource:
                 f"{path}: flow must be at most {most:g} veh/h on {lanes} lanes: check the units "
                 f"and lanes, got {flow.max():.4g} veh/h"
             )
-        is_congested = bool(speed.size) and bool(np.median(speed) < 0.5 * speed_limit)
-        self._check_direction(density, is_congested)
         if speed.size and speed.max() < SLOW * speed_limit:
             warnings.warn(
                 f"no speed of the field is above {speed.max():.0f} km/h, at a limit of "
@@ -183,11 +178,13 @@ class FieldSource:
             _conservation(*each, self.cell, self.interval)
             for each in ((density, flow), (density.T, flow.T))
         )
-        if turned > SURE and not kept > turned - SURER:
+        turn = "reversed" if kept < -SURE else ""
+        if abs(turned) > SURE and not abs(kept) > abs(turned) - SURER:
+            turn = "transposed"
+        if turn:
             warnings.warn(
-                f"{self.density}: what flows into a cell of this field does not stay or flow out, "
-                f"and would if its {density.shape[1]} intervals were the cells: should transposed "
-                "be turned round?",
+                f"{self.density}: vehicles that flow into a cell must stay or flow out, and do not "
+                f"in this field: should {turn} be turned round?",
                 stacklevel=3,
             )
         return density, flow
@@ -229,25 +226,6 @@ class FieldSource:
             f"{' or '.join(likely) or 'none that is known'}, got {USUAL[kind]!r}: {problem}; a "
             "unit that is given is kept"
         )
-
-    def _check_direction(self, density: FloatArray, is_congested: bool) -> None:
-        """Warn where the waves of congested traffic run downstream: they run upstream anywhere."""
-        per_interval = WAVE * self.interval / 3600.0
-        lag = int(np.ceil(WAVE_LENGTH / per_interval))
-        away = round(lag * per_interval / self.cell)
-        cells, intervals = density.shape
-        if not (is_congested and 0 < away <= cells // 2 and lag <= intervals // 4):
-            return
-        rest = density - density.mean(axis=1, keepdims=True)
-        early, late = rest[:, :-lag], rest[:, lag:]
-        upstream = (early[away:] * late[:-away]).sum()
-        downstream = (early[:-away] * late[away:]).sum()
-        if downstream - upstream > 0.1 * (rest**2).sum():
-            warnings.warn(
-                f"{self.density}: queues of this field move downstream, and real ones upstream: "
-                "should reversed be turned round?",
-                stacklevel=4,
-            )
 
     def _off(self, density: FloatArray, other: FloatArray, flow: FloatArray) -> BoolArray:
         """Return where detectors were off, shape (cells, intervals): zeros that cannot be."""

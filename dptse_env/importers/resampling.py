@@ -261,7 +261,7 @@ def step_back(found: pl.DataFrame) -> tuple[int, float, float] | None:
         return None
     back = c("begin") < c("before") - 1.01 * frame
     steps = blocks.sort("group", "first").with_columns(before=before(c("end"))).filter(back)
-    return steps.sort("first").select("first", "before", "begin").row(0)
+    return next(steps.sort("first").select("first", "before", "begin").iter_rows(), None)
 
 
 def _derived(points: pl.DataFrame, place: IntArray, second: IntArray) -> FloatArray:

@@ -1,6 +1,7 @@
 """Import of measured fields."""
 
 import dataclasses
+import itertools
 import warnings
 
 import gymnasium as gym
@@ -191,23 +192,6 @@ def test_a_few_cells_may_be_odd(name, usual, odd, message, tmp_path):
         source.read(4, 110.0)
 
 
-@pytest.mark.parametrize(
-    ("speed", "is_reversed", "warns"),
-    [(30.0, False, False), (30.0, True, True), (90.0, True, False)],
-)
-def test_queues_that_move_downstream_are_told(speed, is_reversed, warns, tmp_path):
-    place, time = 0.05 * np.arange(20)[:, None], 5.0 * np.arange(100)[None]
-    wave = np.sin(2 * np.pi * (time + 3600.0 / 18.0 * place) / 120.0)  # upstream at 18 km/h
-    np.savetxt(tmp_path / "density.txt", 100.0 + 40.0 * wave)
-    np.savetxt(tmp_path / "speed.txt", speed - 10.0 * wave)
-    files = {name: tmp_path / f"{name}.txt" for name in ("density", "speed")}
-    source = FieldSource(**files, cell=0.05, interval=5.0, reversed=is_reversed)
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        source.read(4, 110.0)
-    assert any("reversed" in str(each.message) for each in told) == warns
-
-
 def test_short_gaps_are_filled_and_told_and_long_ones_refused(tmp_path):
     source = write(tmp_path)
     density, flow = source.read(4, 110.0)
@@ -317,28 +301,26 @@ def test_headers_and_index_columns_are_named(rows, columns, got, tmp_path):
         save(tmp_path, ",", **tables).read(3, 100.0)
 
 
-@pytest.mark.parametrize("is_turned", [False, True])
-def test_a_field_whose_rows_are_intervals_is_told(is_turned, tmp_path):
-    density, speed = traffic()
-    for name, turned in (("right", is_turned), ("wrong", not is_turned)):
-        tables = (
-            {"density": density.T, "speed": speed.T}
-            if turned
-            else {"density": density, "speed": speed}
-        )
-        source = dataclasses.replace(save(tmp_path, **tables), transposed=is_turned)
+@pytest.mark.parametrize("transposed", [False, True])
+@pytest.mark.parametrize("backward", [False, True])
+def test_rows_and_cells_in_another_order_are_told(transposed, backward, tmp_path):
+    tables = dict(zip(("density", "speed"), traffic(), strict=True))
+    tables = {name: table[::-1] if backward else table for name, table in tables.items()}
+    tables = {name: table.T if transposed else table for name, table in tables.items()}
+    source = save(tmp_path, **tables)
+    for turns in itertools.product((False, True), repeat=2):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            source.read(3, 100.0)
-        assert any("transposed" in str(each.message) for each in told) == (name == "wrong")
-    with (
-        pytest.warns(UserWarning, match="transposed"),
-        pytest.raises(ValueError, match=r"below the field's 60 s, or transposed given, got 100"),
-    ):
-        import_field(
-            dataclasses.replace(save(tmp_path, density=density.T, speed=speed.T)),
-            FieldRoad("a", segments=3, lanes=3, speed_limit=100.0), tmp_path / "road", SPLITS, 100,
-        )  # fmt: skip
+            dataclasses.replace(source, transposed=turns[0], reversed=turns[1]).read(3, 100.0)
+        words = " ".join(str(each.message) for each in told)
+        assert ("transposed" in words) == (turns[0] != transposed)
+        assert ("reversed" in words) == (turns == (transposed, not backward))
+
+
+def test_a_field_that_is_too_short_may_be_transposed(tmp_path):
+    source = save(tmp_path, density=np.full((60, 12), 60.0), speed=np.full((60, 12), 80.0))
+    with pytest.raises(ValueError, match=r"below the field's 60 s, or transposed given, got 100"):
+        import_field(source, ROAD, tmp_path / "road", SPLITS, 100)
 
 
 def test_a_folder_is_never_replaced(tmp_path):
