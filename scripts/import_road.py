@@ -6,6 +6,7 @@ dptse import trajectories --help
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import re
 import shlex
@@ -32,10 +33,13 @@ from dptse_env.importers.network import (
 )
 from dptse_env.importers.report import REPORT, remarks
 from dptse_env.traffic import Corridor, is_road_file, ranges, read_road, write_corridor
+from dptse_env.utils.fields import require
 from dptse_env.utils.files import replacing
 from scripts.cli import Environment
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
+DATES = 1e8
+"""Times above are counted from a date [s], and not from the start of a file."""
 Shares = tuple[float, float, float]
 SHARES: Shares = (0.6, 0.2, 0.2)
 
@@ -79,6 +83,8 @@ class Trajectories(Environment):
 
     def run(self) -> None:
         """Import, and print which traffic seeds there are and what to do next."""
+        once = len({path.resolve() for path in self.files}) == len(self.files)
+        require(once, "files", "given once each", [str(path) for path in self.files])
         env, keywords = parse_env(self.env)
         road = keywords.get("corridor")
         environment = read_road(road).environment if is_road_file(road) else {}
@@ -96,6 +102,7 @@ class Trajectories(Environment):
                 print(f"{file['file']}: {remark}")
         for note in imported.report["notes"]:
             print(f"note: {note}")
+        print_overlap(imported.report)
         print_seeds(imported.seeds)
         print(f"road: {self.output / ROAD}\nreport: {self.output / REPORT}")
         print_next(self.output / ROAD, imported.seeds, imported.corridor, env, keywords)
@@ -266,6 +273,19 @@ def print_seeds(seeds: Mapping[str, tuple[int, ...]]) -> None:
     """Print the traffic seeds of each part."""
     for name, given in seeds.items():
         print(f"{name}: {len(given)} window(s), traffic seeds {ranges(given)}")
+
+
+def print_overlap(report: Mapping[str, Any]) -> None:
+    """Tell of windows of two files at one time, where times are dates and not those of a file."""
+    windows = sorted(report["windows"], key=lambda each: (each["group"], each["start"]))
+    for one, other in itertools.pairwise(windows):
+        same = one["group"] == other["group"] and one["file"] != other["file"]
+        if same and DATES < other["start"] <= one["start"] + report["duration"]:
+            print(
+                f"note: {one['file']} and {other['file']} overlap in time, from "
+                f"{other['start']:.10g} s on: the same vehicles may be in windows of both"
+            )
+            return
 
 
 def print_next(

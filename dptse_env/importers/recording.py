@@ -20,7 +20,7 @@ from dptse_env.importers.resampling import (
     TIME_UNIT,
     check_pieces,
     count_ends,
-    step_back,
+    steps_back,
     stretches,
     whole_seconds,
 )
@@ -264,9 +264,10 @@ class Recording:
 
     def _require_one_clock(self) -> None:
         """Refuse a file that is sorted by time and whose time steps back over other vehicles."""
-        step = step_back(pl.concat(self._stretches))
-        if step is not None:
-            row, *times = step
+        steps, overlap = steps_back(pl.concat(self._stretches))
+        self.counts["steps_back"] = len(steps)
+        if overlap:
+            row, *times = steps[0]
             before, at = (f"{time + self.base - self.shift:.10g} s" for time in times)
             raise TrajectoryError(
                 f"{self.path}, row {row}: the time must not step back into the traffic before, got "

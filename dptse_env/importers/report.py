@@ -25,6 +25,7 @@ _COUNTS = {
         "far_away": "dropped: ten minutes or more from all windows; are these times right?",
         "duplicates": "dropped: duplicates of another row",
         "pauses": "times of half a minute or more without a row: the road counts as empty there",
+        "steps_back": "steps back of the whole file's time; its parts are put in order of time",
         "out_of_order": "out of order in time, sorted",
         "seconds": "vehicles at whole seconds, from the others",
         "negative_speeds": "of these with a speed below 0, set to 0",

@@ -226,8 +226,8 @@ def stretches(points: pl.DataFrame, longest_gap: float) -> pl.DataFrame:
     return found if 2 * len(found) <= len(kept) else found.clear()
 
 
-def step_back(found: pl.DataFrame) -> tuple[int, float, float] | None:
-    """Return where the time of a file that is sorted by time steps back into traffic before.
+def steps_back(found: pl.DataFrame) -> tuple[list[tuple[int, float, float]], bool]:
+    """Return where the time of a file that is sorted by time steps back.
 
     Such a file has several recordings, or its clock was set back. A file that is sorted by vehicle
     has none: there, the rows of vehicles that are on the road at one time do not alternate.
@@ -236,7 +236,8 @@ def step_back(found: pl.DataFrame) -> tuple[int, float, float] | None:
         found: All its `stretches`.
 
     Returns:
-        The row, and the times before and at it [s].
+        The row, and the times before and at it [s], of each step; and whether traffic before and
+        after any lies over one another.
     """
     c = pl.col
     found = found.sort("group", "first")
@@ -256,12 +257,13 @@ def step_back(found: pl.DataFrame) -> tuple[int, float, float] | None:
         .group_by("group", "block")
         .agg(c("first").min(), c("begin").min(), c("end").max())
     )
-    overlap = c("begin") < before(c("end").cum_max()) - 1.01 * frame
-    if not by_time or not blocks.sort("group", "begin").select(overlap.any()).item():
-        return None
-    back = c("begin") < c("before") - 1.01 * frame
+    latest = before(c("end").cum_max())
+    overlap = pl.min_horizontal("end", latest) - c("begin") > 1.01 * frame
+    overlaps = blocks.sort("group", "begin").select(overlap & latest.is_not_null())
+    back = by_time & (c("begin") < c("before") - 1.01 * frame)
     steps = blocks.sort("group", "first").with_columns(before=before(c("end"))).filter(back)
-    return next(steps.sort("first").select("first", "before", "begin").iter_rows(), None)
+    rows = steps.sort("first").select("first", "before", "begin").rows()
+    return rows, bool(rows) and bool(overlaps.to_series().any())
 
 
 def _derived(points: pl.DataFrame, place: IntArray, second: IntArray) -> FloatArray:
