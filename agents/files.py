@@ -1,32 +1,13 @@
-"""JSON files, complete or not there, and refusals to write over others."""
+"""JSON files, complete or not there, and what two of them differ in."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from dptse_env.utils.files import write_atomically
-
-
-def refuse_to_replace(paths: Iterable[Path], force: bool) -> None:
-    """Refuse to write over what an earlier run left, unless that is wanted.
-
-    Programs that go on where they stopped do not ask.
-
-    Args:
-        paths: Files that are going to be written.
-        force: Whether they may be replaced.
-
-    Raises:
-        FileExistsError: One is there, and it may not be replaced.
-    """
-    there = [str(path) for path in paths if path.exists()]
-    if there and not force:
-        raise FileExistsError(
-            f"{', '.join(there)} would be replaced: choose another --output, or give --force"
-        )
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import traceback
 from collections.abc import Mapping, Sequence
@@ -200,16 +199,15 @@ def record(
 
     Raises:
         ValueError: A seed is out of range or was not recorded.
-        RecordingError: A recording fails.
+        RecordingError: A recording fails, or the folder cannot be written.
         NetworkError: The corridor has to be compiled and cannot be.
         SumoVersionError: libsumo is missing, broken or of another release series.
     """
     library: RecordLibrary = open_library(records)
-    if not library.missing(corridor, seeds):
+    missing = library.missing(corridor, seeds)
+    if not missing or corridor.recordings is not None:
         return
-    library.path.mkdir(parents=True, exist_ok=True)
-    name = hashlib.sha256(corridor.digest.encode()).hexdigest()[:16]
-    with FileLock(library.path / f".{name}.lock"):
+    with FileLock(library.prepare(corridor, missing[0]) / ".lock"):
         library.ensure(corridor, seeds, workers, progress)
 
 

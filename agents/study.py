@@ -32,6 +32,12 @@ from dptse_env.versions import code_version, numbers_of
 ROWS, TABLES = "rows.parquet", "tables.md"
 """Files of a study's folder, beside its figures."""
 
+PARTS = "rows"
+"""Folder below it of the rows of cells, until all are there."""
+
+OWN = (ROWS, PARTS)
+"""Names by which a folder is known to be of a study, which goes on there."""
+
 ORIGIN = ("study", "version", "cell")
 """Columns in front of the labels."""
 
@@ -158,7 +164,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
         cell.check()
     for corridor, seeds in dict.fromkeys((corridor_of(cell), seeds) for cell, seeds in missing):
         record(corridor, seeds, place.records, progress=progress)
-    folder = place.folder / "rows"
+    folder = place.folder / PARTS
     threads = None if isinstance(place.executor, ThisProcess) else 1
     if missing:
         folder.mkdir(exist_ok=True)
@@ -210,7 +216,7 @@ def read_rows(study: str, folder: Path) -> pl.DataFrame:
     """
     keys = (*ORIGIN, "traffic_seed")
     tables = []
-    for path in (folder / ROWS, *sorted((folder / "rows").glob("*.parquet"))):
+    for path in (folder / ROWS, *sorted((folder / PARTS).glob("*.parquet"))):
         if path.exists():
             tables.append(read_table(path, keys))
             others = [name for name in tables[-1]["study"].unique() if name != study]

@@ -13,10 +13,10 @@ from typing import Any
 
 from agents.audit.report import audit_environment, audit_one_run, check_target
 from agents.environments import make_config, parse_env
-from agents.files import refuse_to_replace
 from agents.play import Cell
 from dptse_env.parts import privacy_report
 from dptse_env.utils.fields import inside, integer, positive, require
+from dptse_env.utils.files import require_output
 from scripts.cli import Environment, Machines
 
 
@@ -74,7 +74,7 @@ def main(args: Args) -> None:
     noise = "" if args.noise_factor == 1.0 else f"-noise-{args.noise_factor:g}"
     attack = "one-run" if args.one_run else f"{args.target}-{args.policy}"
     path = args.output / f"{preset}-{attack}{noise}.json"
-    refuse_to_replace([path], args.force)
+    require_output(args.output, [path.name], force=args.force)
 
     executor = args.start_executor()
     library = args.library(config.corridor, [args.traffic_seed])

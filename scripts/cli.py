@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -26,6 +27,8 @@ from dptse_env.traffic import (
     RecordLibrary,
     SumoVersionError,
 )
+from dptse_env.utils.fields import integer
+from dptse_env.utils.files import require_writable
 from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
 
@@ -58,6 +61,17 @@ class Recording:
     """Processes on this machine; one for each core if not given."""
     records: Path | None = None
     """Folder of the record cache; the user's if not given."""
+
+    def check(self) -> None:
+        """Check them before anything else is done.
+
+        Raises:
+            ValueError: A number is out of range, or the folder is none and cannot be made.
+        """
+        if self.workers is not None:
+            integer("workers", self.workers, 1)
+        if self.records is not None and not self.records.is_dir():
+            require_writable("records", self.records)
 
     def library(self, corridor: Corridor, seeds: Sequence[int]) -> RecordLibrary:
         """Return the library of records, after recording what is missing."""
@@ -116,7 +130,8 @@ def run(
     """Parse the command line into ``arguments`` and call ``main`` with them.
 
     Bad input ends the program with status 2, and a run that fails with status 1, both with a
-    message in one line. Ctrl-C ends it with status 130. Any other exception is a mistake of the
+    message in one line. Ctrl-C ends it with status 130, and SIGTERM as Ctrl-C does, with status
+    143: what runs is ended, and what is half written goes. Any other exception is a mistake of the
     program, and keeps its traceback.
 
     Args:
@@ -133,17 +148,33 @@ def run(
         given = tyro.cli(
             arguments, prog=program, args=words, description=description, config=config
         )
-        with logging_redirect_tqdm(), warnings_told_once():
+        with logging_redirect_tqdm(), warnings_told_once(), interrupted_by_sigterm():
+            if isinstance(given, Recording):
+                given.check()
             main(given)
     except BrokenPipeError:  # an OSError that is no failure; dptse_env.command_line ends it
         raise
     except (*BAD_INPUT, *FAILURES) as problem:
         print(f"error: {_in_words(problem)}", file=sys.stderr)
         raise SystemExit(2 if isinstance(problem, BAD_INPUT) else 1) from problem
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         goes_on = "goes on from what is done" if resumes else "begins anew"
         print(f"\ninterrupted: the same command {goes_on}", file=sys.stderr)
-        raise SystemExit(130) from None
+        raise SystemExit(128 + (*interrupt.args, signal.SIGINT)[0]) from None
+
+
+@contextlib.contextmanager
+def interrupted_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM, by which schedulers of clusters end programs, be as Ctrl-C."""
+
+    def interrupt(number: int, _: object) -> None:
+        raise KeyboardInterrupt(number)
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextlib.contextmanager

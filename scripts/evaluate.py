@@ -20,13 +20,12 @@ import polars as pl
 
 from agents.environments import make_config, parse_env
 from agents.figures import RoadMap, draw_bars, draw_errors, draw_maps, estimate_map, save_figure
-from agents.files import refuse_to_replace
 from agents.page import watch, write_page
 from agents.play import Cell
 from agents.policies import NamedSchedule, find_policy, policy_name
 from agents.seeds import seed_kind
 from agents.statistics import Interval
-from agents.study import ROWS, TABLES, Study, read_rows
+from agents.study import OWN, PARTS, ROWS, TABLES, Study, read_rows
 from agents.study import run as run_study
 from agents.tables import (
     DENSITY,
@@ -46,6 +45,7 @@ from dptse_env.privacy import rounded_up
 from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import require
+from dptse_env.utils.files import require_output
 from scripts.cli import Environment, Machines
 
 ALL = "all"
@@ -291,11 +291,13 @@ def make_title(cell: Cell, seeds: Sequence[int]) -> str:
 
 def main(args: Args) -> None:
     """Record what is missing, evaluate, and write tables, rows and figures."""
-    names = (ROWS, TABLES, ERRORS, MAPS, *([PAGE] if args.html else []))
-    refuse_to_replace([args.output / name for name in names], args.force)
     cells, seeds = make_cells(args), parse_seeds(args.seeds)
     for cell in cells:
         cell.check()
+    # The tables are written last: without them an evaluation goes on.
+    require_output(args.output, [TABLES], force=args.force)
+    figures = (ERRORS, MAPS, *([PAGE] if args.html else []))
+    require_output(args.output, figures, own=OWN, force=args.force)
     title, ids = make_title(cells[0], seeds), {cell.id for cell in cells}
 
     def report(rows: pl.DataFrame, folder: Path) -> str:
@@ -316,10 +318,12 @@ def main(args: Args) -> None:
         draw_traffic(args, title, scores, cells)
         return write_markdown(title, scores, args.reference)
 
+    place = args.place(args.output)
     if args.force:
-        (args.output / ROWS).unlink(missing_ok=True)
-        shutil.rmtree(args.output / "rows", ignore_errors=True)
-    run_study(Study("evaluation", tuple(cells), seeds, report), args.place(args.output))
+        for name in (ROWS, TABLES, *figures):
+            (args.output / name).unlink(missing_ok=True)
+        shutil.rmtree(args.output / PARTS, ignore_errors=True)
+    run_study(Study("evaluation", tuple(cells), seeds, report), place)
     rows = read_rows("evaluation", args.output).filter(pl.col("cell").is_in(ids))
     scores = score(rows, cells, args.reference)
     if args.json:

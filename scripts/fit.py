@@ -44,7 +44,7 @@ from dptse_env.model.parameters import read_parameters, write_parameters
 from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import RecordLibrary, ranges
 from dptse_env.utils.fields import integer, require
-from dptse_env.utils.files import replacing, write_atomically
+from dptse_env.utils.files import replacing, require_output, write_atomically
 from dptse_env.versions import code_version
 from scripts.cli import Machines
 
@@ -94,6 +94,8 @@ def main(args: Args) -> None:
     folder = args.output or args.road.with_name(f"{args.road.stem}-fit")
     seeds = {"training": args.training, "validation": args.validation, "test": args.test}
     road, stages = find_road(args.road, args.env, folder, seeds), folder / STAGES
+    require_output(folder, own=[STAGES])
+    require_output(args.road.parent, ())
     road.check(stages, args.tries)
     place = args.place(stages)
 

@@ -18,7 +18,6 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from agents.environments import parse_env
-from agents.files import refuse_to_replace
 from agents.seeds import KINDS
 from dptse_env.importers import Options, Source, Split, import_trajectories, read_source
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
@@ -34,7 +33,7 @@ from dptse_env.importers.network import (
 from dptse_env.importers.report import REPORT, remarks
 from dptse_env.traffic import Corridor, is_road_file, ranges, read_road, write_corridor
 from dptse_env.utils.fields import require
-from dptse_env.utils.files import replacing
+from dptse_env.utils.files import replacing, require_output
 from scripts.cli import Environment
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
@@ -207,12 +206,13 @@ class Network:
         """Import, write the road and print what it is."""
         if self.output.suffix != ".toml":
             raise ValueError(f"output must be a .toml file, got {self.output}")
-        refuse_to_replace([self.output], self.force)
         edges = self.path.split()
         between = "..." in edges
         if not edges or (between and (len(edges) != 3 or edges[1] != "...")):
             raise ValueError(f"path must be edges, or two with ... between them, got {self.path!r}")
-        files, ends = self._files(), (self.first_position, self.last_position)
+        files = self._files()
+        require_output(self.output.parent, [self.output.name], force=self.force)
+        ends = self.first_position, self.last_position
         layout = find_layout(
             files,
             edges[::2] if between else edges,

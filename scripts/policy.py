@@ -21,11 +21,11 @@ from gymnasium import spaces
 from tyro.conf import Positional
 
 from agents.environments import make_config
-from agents.files import refuse_to_replace
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface
-from dptse_env.policies import DETERMINISTIC
+from dptse_env.policies import DETERMINISTIC, SUFFIX
 from dptse_env.utils.fields import parse_json, require
+from dptse_env.utils.files import require_output
 
 ENCODINGS: dict[type[gym.Space[Any]], str] = {
     spaces.MultiBinary: "mask",
@@ -66,9 +66,11 @@ def main(args: Args) -> None:
     for path in (args.model, args.vecnormalize):
         if path is not None and not path.is_file():
             raise FileNotFoundError(f"there is no file {path}")
-    refuse_to_replace([args.output], args.force)
+    require(args.output.suffix == SUFFIX, "output", f"a {SUFFIX} file", str(args.output))
     keywords = parse_json(args.keywords, "keywords")
     require(isinstance(keywords, dict), "keywords", "a JSON object", args.keywords)
+    make_config(args.env, keywords)
+    require_output(args.output.parent, [args.output.name], force=args.force)
     policy, about = _unpickled(args.model, _read_model)
     kind = type(policy.action_space)
     require(kind in ENCODINGS, "model", "one whose action space an encoding has", kind.__name__)

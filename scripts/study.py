@@ -20,10 +20,11 @@ import tyro
 from agents.environments import parse_env
 from agents.play import Cell
 from agents.seeds import seed_kind
-from agents.study import Study, write_report
+from agents.study import OWN, Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
 from dptse_env.utils.fields import require
+from dptse_env.utils.files import require_output
 from scripts.cli import Machines
 
 STUDIES = ("paper", "guarantees", "estimators", "roads", "policies", "suite")
@@ -159,6 +160,7 @@ def main(args: Args) -> None:
             "given with an output of its own, since the rows are others",
             getattr(args, name),
         )
+    require_output(folder, () if args.report else None, own=OWN)
     if args.report:
         write_report(study, folder)
         print(f"tables and figures are in {folder}/")

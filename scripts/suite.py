@@ -20,10 +20,11 @@ from agents.files import write_json
 from agents.play import Cell
 from agents.policies import policy_name
 from agents.studies import suite
-from agents.study import Study, play_study
+from agents.study import OWN, Study, play_study
 from agents.tables import are_present
 from agents.terminal import make_table, print_table
 from dptse_env.utils.fields import require, require_name
+from dptse_env.utils.files import require_output
 from scripts.cli import Machines
 
 CARD = "card.json"
@@ -54,6 +55,7 @@ def main(args: Args) -> None:
     (entry,) = {each.labels["policy"] for each in cells}
     # A schedule by "module:Class" has a character that not every system allows in a path.
     folder = args.output or Path("results/my-suite") / entry.replace(":", "-")
+    require_output(folder, own=OWN)
     study = Study("suite", cells, suite.SEEDS, lambda rows, folder: "")
     place, recorded = args.place(folder), suite.recorded_rows()
     played = play_study(study, place)

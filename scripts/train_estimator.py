@@ -35,11 +35,11 @@ from agents.filters.scenarios import Kind, ScenarioRanges
 from agents.filters.training import WEIGHTS, FilterTraining
 from agents.play import record
 from agents.terminal import make_table, print_table
-from agents.training.run_files import PROGRESS, Row, check_plan, read_progress
+from agents.training.run_files import PLAN, PROGRESS, Row, check_plan, read_progress
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import member_for, read_network
 from dptse_env.utils.fields import from_mapping, parse_json, require
-from dptse_env.utils.files import replacing
+from dptse_env.utils.files import replacing, require_output
 from scripts.cli import Machines
 
 NAME = "network"
@@ -127,11 +127,13 @@ def main(args: Args) -> None:
         for kind in dict.fromkeys(args.kinds)
         for seed in seeds
     ]
-    for plan, folder in tasks:
-        check_plan(folder, plan.settings())
     plans = list({plan.kind: plan for plan, _ in tasks}.values())
     for plan in plans:
         plan.check()
+    for plan, folder in tasks:
+        check_plan(folder, plan.settings())
+    own = [f"{folder.name}/{PLAN}" for _, folder in tasks]
+    require_output(args.output, [f"{NAME}-{kind}.safetensors" for kind in args.kinds], own=own)
     executor = args.start_executor()
     record_all(args, plans, executor)
     last: dict[Path, Row] = {}

@@ -20,11 +20,11 @@ from pathlib import Path
 import optuna
 
 from agents.executors import make_executor
-from agents.files import refuse_to_replace
 from agents.search.space import SPACE, Extra
 from agents.search.tuning import Search, chosen, journal_path, tune, write
 from agents.terminal import make_table, print_table
 from dptse_env.utils.fields import integer
+from dptse_env.utils.files import require_output
 from scripts.cli import Recording
 
 
@@ -84,7 +84,7 @@ def main(args: Args) -> None:
     """Record what is missing, run the trials that are missing, and write the sets."""
     searches, executor = make_searches(args), make_executor("local", args.workers)
     foreign = [name for name, s in searches.items() if not journal_path(s, args.output).exists()]
-    refuse_to_replace([args.output / f"{name}.json" for name in foreign], args.force)
+    require_output(args.output, [f"{name}.json" for name in foreign], force=args.force)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     columns = "set", "settings", "reward", "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"
     table = make_table("scores on the tuning traffic", *columns, left=2)

@@ -13,7 +13,7 @@ import torch
 
 from agents.files import first_difference, write_json
 from dptse_env.utils.fields import cut, read_json, require
-from dptse_env.utils.files import write_atomically
+from dptse_env.utils.files import require_output, write_atomically
 
 PLAN, CHECKPOINT, PROGRESS = "plan.json", "checkpoint.pt", "progress.csv"
 
@@ -39,12 +39,12 @@ def check_plan(folder: Path, plan: Mapping[str, Any]) -> None:
     """Check that a training can begin in a folder, or go on there.
 
     Raises:
-        ValueError: The folder has the training of another plan, or something else.
+        ValueError: The folder has the training of another plan, or something else, or cannot be
+            written.
     """
+    require_output(folder, own=[PLAN])
     path = folder / PLAN
     if not path.exists():
-        if folder.exists() and any(folder.iterdir()):
-            raise ValueError(f"{folder} is not empty and has no {PLAN}: choose another --output")
         return
     kept = read_json(path)
     require(isinstance(kept, dict), str(path), "the plan of a training", kept)

@@ -37,6 +37,7 @@ from dptse_env.utils.fields import (
     require,
     require_name,
 )
+from dptse_env.utils.files import require_output
 
 UNITS = {
     "density": {f"veh/{name}": 1.0 / LENGTHS[name] for name in ("km", "mi", "ft", "m")},
@@ -427,6 +428,7 @@ def import_field(
     """
     integer("duration", duration, 1)
     integer("segments", road.segments, 2)
+    require_output(output.parent, [output.name])
     density, flow = source.read(road.lanes, road.speed_limit)
     each = source.cells_of(road.segments, len(density))
     field = np.stack(by_second(density, flow, road.segments + 2, source.interval), axis=-1)

@@ -25,6 +25,7 @@ from dptse_env.traffic.imported import Kind, load_record, ranges, save_record, w
 from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.fields import require, require_name
+from dptse_env.utils.files import require_output
 
 ROAD = "road.toml"
 SMALLEST_SHARE = 0.001
@@ -258,10 +259,10 @@ def new_folder(output: Path) -> Iterator[Path]:
     Its parent is a folder for this alone, in which the body may leave what is thrown away.
 
     Raises:
-        ValueError: There is something at `output`.
-        OSError: It cannot be written.
+        ValueError: There is something at `output`, or it cannot be written.
+        OSError: The disk is full.
     """
-    require(not output.exists(), "output", "a folder that does not exist yet", str(output))
+    require_output(output.parent, [output.name])
     output.parent.mkdir(parents=True, exist_ok=True)
     work = output.parent / f".{output.name}-{uuid.uuid4().hex}"
     folder = work / "result"

@@ -16,7 +16,6 @@ import logging
 import math
 import multiprocessing
 import os
-import tempfile
 import threading
 import time
 from collections import OrderedDict
@@ -35,10 +34,11 @@ from dptse_env.traffic.recording import record_seeds
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, sumo_version
 from dptse_env.traffic.sumo_input import NetworkError
 from dptse_env.utils.fields import integer, require
+from dptse_env.utils.files import require_writable
 from dptse_env.utils.threads import n_cores
 
 CACHE_VARIABLE = "DPTSE_CACHE"
-"""Environment variable with the directory of the records."""
+"""Environment variable with the directory of the records; errors name it."""
 
 MEMORY = 2**28
 """Size of the records that a library keeps in memory [bytes], if nothing else is said."""
@@ -160,6 +160,27 @@ class RecordLibrary:
         folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}.safetensors"
 
+    def prepare(self, corridor: Corridor, seed: int) -> Path:
+        """Make the folder of a record that is going to be written, and return it.
+
+        Abandoned records in it are removed.
+
+        Raises:
+            RecordingError: It cannot be made or written to.
+        """
+        folder = self.record_path(corridor, seed).parent
+        try:
+            require_writable(CACHE_VARIABLE if self.is_default else "records", folder)
+            folder.mkdir(parents=True, exist_ok=True)
+        except (ValueError, OSError) as error:
+            raise RecordingError.from_cause(corridor, seed, str(error)) from error
+        for leftover in folder.glob(".*-*"):
+            # Its writer may finish just now, and another user may own it.
+            with contextlib.suppress(FileNotFoundError, PermissionError):
+                if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE:
+                    leftover.unlink()
+        return folder
+
     def _load_or_record(self, corridor: Corridor, seed: int) -> Record:
         if corridor.recordings is not None:
             return load_record(corridor.recordings, seed, corridor.record_layout)
@@ -180,10 +201,7 @@ class RecordLibrary:
         self, corridor: Corridor, seeds: list[int], workers: int = 1, progress: bool = False
     ) -> None:
         paths = {seed: self.record_path(corridor, seed) for seed in seeds}
-        try:
-            _prepare(paths[seeds[0]].parent)
-        except OSError as error:
-            raise RecordingError.from_cause(corridor, seeds[0], str(error)) from error
+        self.prepare(corridor, seeds[0])
         if not progress:
             _say_recording(corridor, math.ceil(len(seeds) / workers))
         sources = {seed: _source(corridor, seed) for seed in seeds}
@@ -259,19 +277,3 @@ def _say_recording(corridor: Corridor, n_seeds: int) -> None:
 
 def _source(corridor: Corridor, seed: int) -> dict[str, object]:
     return {"corridor": corridor.digest, "seed": seed, "sumo": sumo_version()}
-
-
-def _prepare(folder: Path) -> None:
-    """Create the folder, check that it is writable, and remove abandoned records in it.
-
-    Raises:
-        OSError: It cannot be created or written to.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=folder):
-        pass
-    for leftover in folder.glob(".*-*"):
-        # Its writer may finish just now, and another user may own it.
-        with contextlib.suppress(FileNotFoundError, PermissionError):
-            if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE:
-                leftover.unlink()

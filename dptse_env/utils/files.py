@@ -1,4 +1,4 @@
-"""Files that are complete or not there, their digests, and arrays with a card.
+"""Files that are complete or not there, their places and digests, and arrays with a card.
 
 Weights and records are files in the format of safetensors: a header in JSON, then the arrays as
 they are in memory. Their card, what one should know of the arrays, stands in the header's
@@ -10,9 +10,10 @@ import hashlib
 import json
 import os
 import stat
+import tempfile
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,71 @@ PATIENCE = 5.0 if os.name == "nt" else 0.0
 """Longest wait for readers of a file that is to be replaced [s]; Windows refuses it meanwhile."""
 
 _DIGEST = "sha256"
+
+
+def require_writable(what: str, folder: Path) -> None:
+    """Refuse a folder that neither is there nor can be made, or that nothing can be written to.
+
+    Args:
+        what: Name of the folder in the message.
+        folder: The folder, which may be missing, with its parents. It is left as it is.
+
+    Raises:
+        ValueError: See above.
+    """
+    try:
+        place = _lowest_there(folder)
+        # Modes of files do not tell it: of root, of a read-only disk, of Windows.
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as problem:
+        allowed = "a folder that can be written, or be made"
+        raise ValueError(f"{what} must be {allowed}, got {folder}: {problem.strerror}") from problem
+
+
+def _lowest_there(path: Path) -> Path:
+    """Return a path, or the lowest of its parents that exists."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return _lowest_there(path.parent)
+    return path
+
+
+def require_output(
+    folder: Path,
+    names: Iterable[str] | None = None,
+    *,
+    own: Iterable[str] = (),
+    force: bool | None = None,
+) -> None:
+    """Refuse a folder where results cannot go. Ask before any work: a refusal loses nothing then.
+
+    Args:
+        folder: The folder, which may be missing, with its parents.
+        names: What is going to be written there. If None, the folder has to be empty but for hidden
+            files.
+        own: Files or folders by one of which an earlier run is known, which is gone on with and
+            replaces nothing.
+        force: Whether files may be replaced; None where nobody can allow it.
+
+    Raises:
+        ValueError: Something else is there, or nothing can be written there.
+    """
+    require_writable("output", folder)
+    if any((folder / name).exists() for name in own):
+        return
+    if names is None:
+        present = sorted(folder.iterdir()) if folder.is_dir() else []
+        there = [path for path in present if not path.name.startswith(".")][:1]
+    else:
+        there = [path for path in map(folder.joinpath, names) if os.path.lexists(path)]
+    if force:  # which is no leave to remove a folder
+        there = [path for path in there if path.is_dir()]
+    if there:
+        instead = "choose another one" + (", or give --force" if force is False else "")
+        found = ", ".join(map(str, there))
+        raise ValueError(f"output must not exist yet, got {found}: {instead}")
 
 
 def read_tensors(

@@ -50,7 +50,7 @@ def test_other_errors_name_the_option(tmp_path):
             run(path, **arguments)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
     run(path)
-    with pytest.raises(ValueError, match="output must be a folder that does not exist yet"):
+    with pytest.raises(ValueError, match="output must not exist yet, got "):
         run(path)
 
 

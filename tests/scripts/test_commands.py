@@ -302,24 +302,6 @@ def test_a_file_that_cannot_be_read_is_named(kind, how, tmp_path, monkeypatch):
     assert {entry.name for entry in tmp_path.iterdir()} <= {name}
 
 
-REPLACED = {
-    "evaluate": ["--env", SHORT, "rows.parquet"],
-    "audit": ["paced-worst-case-hunter.json"],
-    "import network": ["--path", "a b", "road.toml"],
-}
-
-
-@pytest.mark.parametrize("name", REPLACED)
-def test_results_are_not_replaced_without_force(name, tmp_path):
-    *words, file = REPLACED[name]
-    path = tmp_path / file
-    path.write_text("mine")
-    line = refused(*name.split(), *words, "--output", path if "import" in name else tmp_path)
-    assert str(path) in line
-    assert "--force" in line
-    assert path.read_text() == "mine"
-
-
 def test_an_unfit_policy_is_found_before_anything_is_recorded(tmp_path):
     pytest.importorskip("sb3_contrib")
     policy = save_untrained(tmp_path / "policy.safetensors", bandwidth=3)

@@ -25,7 +25,7 @@ def test_it_leaves_a_set_per_configuration(tmp_path, capsys):
         keywords["estimator_settings"] = str(tmp_path / f"{name}.json")
         assert env.config == gym.make(SHORT, privacy=privacy, **keywords).unwrapped.config
     (tmp_path / "random_walk-paper-paper.journal").unlink()
-    with pytest.raises(FileExistsError, match=r"random_walk-paper-paper\.json"):
+    with pytest.raises(ValueError, match=r"random_walk-paper-paper\.json"):
         main(args)
 
 

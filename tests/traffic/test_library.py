@@ -183,12 +183,13 @@ def test_a_library_that_cannot_grow_says_what_it_holds_and_why(tmp_path, monkeyp
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
     forbid_recording(monkeypatch)  # it is known before an hour of simulation
     held = re.escape(f"{tmp_path} holds 3 of the 5")
-    pattern = rf"{held} .* seed 3 failed: .*{os.strerror(errno.EROFS)}"
+    pattern = rf"{held} .* seed 3 failed: records must be .*{os.strerror(errno.EROFS)}"
     for workers in (1, 2):
         with pytest.raises(RecordingError, match=pattern):
             records.ensure(SHORT_HIGHWAY, [*range(5), 4], workers=workers)
-    with pytest.raises(RecordingError, match=r"holds 0 of the 1 .*seed 4 failed"):
-        records.get(SHORT_HIGHWAY, 4)
+    monkeypatch.setenv("DPTSE_CACHE", str(tmp_path))
+    with pytest.raises(RecordingError, match=r"holds 0 of the 1 .*seed 4 failed: DPTSE_CACHE must"):
+        RecordLibrary().get(SHORT_HIGHWAY, 4)
     records.ensure(SHORT_HIGHWAY, range(3))
     assert records.get(SHORT_HIGHWAY, 1).n_rows == 1
     assert records.missing(SHORT_HIGHWAY, (5, np.int64(2), 3, 0, 5)) == [5, 3]

@@ -21,8 +21,8 @@ from agents.studies.roads import idm as simulator
 from dptse_env.importers.folder import ROAD, measure, new_folder, save_records
 from dptse_env.traffic import Corridor, Record, RecordLibrary, read_corridor, write_corridor
 from dptse_env.traffic.imported import load_record
-from dptse_env.traffic.library import default_path
-from dptse_env.utils.files import file_digest
+from dptse_env.traffic.library import CACHE_VARIABLE, default_path
+from dptse_env.utils.files import file_digest, require_writable
 
 IDM_SEEDS = tuple(range(2000, 2016))
 
@@ -100,6 +100,7 @@ def _made_once(name: str, write: Callable[[Path], None]) -> Corridor:
     """Return the road of a folder in the cache, which is written if it is not there."""
     folder = default_path() / "roads" / name
     if not folder.exists():
+        require_writable(CACHE_VARIABLE, default_path())
         folder.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(folder.parent / f".{name}.lock"):
             if not folder.exists():

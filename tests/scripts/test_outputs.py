@@ -1,0 +1,112 @@
+"""Where results go is looked at before any work, by every command that writes some."""
+
+import errno
+
+import pytest
+
+pytest.importorskip("sb3_contrib")
+pytest.importorskip("tyro")
+
+from dptse_env.importers import folder
+from dptse_env.importers.fields import FieldSource
+from dptse_env.traffic import library
+from dptse_env.utils import files
+from scripts import import_road, policy
+from scripts.dptse import MODULES
+from tests.helpers import SHORT, fast_and_slow
+from tests.importers.data import plain, stream
+from tests.importers.network.conftest import motorway
+from tests.scripts.commands import refused, run_command
+from tests.scripts.test_import_road import on
+from tests.scripts.test_train_estimator import SMALL
+
+ROAD = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
+TABLE = "\n".join(" ".join(["30"] * 60) for _ in range(16))
+ONE = ["--workers", "1"]
+COMMANDS = {
+    "evaluate": (["--env", SHORT, *ONE], "tables.md"),
+    "train": (["--env", SHORT, "--steps", "100", *ONE], "best.safetensors"),
+    "train-estimator": (SMALL, "network-flows.safetensors"),
+    "tune": (["--env", SHORT, "--estimators", "random_walk"], "random_walk-paper-paper.json"),
+    "suite": (["speed-front", "--cells", "short", *ONE], "card.json"),
+    "study": (["examples.my_study:STUDY", *ONE], "tables.md"),
+    "fit": (["road.toml", *ONE], "page.html"),
+    "audit": (["--env", SHORT, *ONE], "paper-worst-case-hunter.json"),
+    "record": (["--env", SHORT], None),
+    "import trajectories": (
+        ["--files", "points.csv", "--format", "table", "--env", on("road.toml"), "--columns",
+         "time=t", "vehicle=id", "x=s", "speed=v"], "",
+    ),
+    "import field": (
+        ["--density", "table.txt", "--speed", "table.txt", "--cell", "0.1", "--interval", "5",
+         "--name", "a", "--segments", "6", "--lanes", "3", "--speed-limit", "100"], "",
+    ),
+    "import network": (["--net", "road.net.xml", "--path", "a b"], ".toml"),
+    "policy": (["import", "model.zip", "--env", SHORT, "--trust"], ".safetensors"),
+}  # fmt: skip
+"""Arguments of each command, and what it must not replace: a file in its output, or the output
+itself, of some ending."""
+
+FAST = ("evaluate", "train", "fit", "audit", "record", "policy")
+
+
+class BegunError(Exception):
+    """The work that takes time was begun."""
+
+
+def begin(*_, **__):
+    raise BegunError
+
+
+def refuse(**_):
+    raise PermissionError(errno.EACCES, "Permission denied")
+
+
+def test_every_command_with_an_output_is_here():
+    assert {name.split()[0] for name in COMMANDS} == {*MODULES} - {"info", "replay-field"}
+
+
+@pytest.mark.parametrize("name", fast_and_slow(COMMANDS, FAST))
+def test_a_place_where_results_cannot_go_is_refused_before_any_work(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DPTSE_CACHE", str(tmp_path / "cache"))
+    for where, work in (
+        (library, "record_seeds"), (policy, "_unpickled"), (import_road, "find_layout"),
+        (folder, "Recording"), (FieldSource, "read"),
+    ):  # fmt: skip
+        monkeypatch.setattr(where, work, begin)
+    plain(tmp_path / "points.csv", stream())
+    (tmp_path / "road.toml").write_text(ROAD)
+    (tmp_path / "table.txt").write_text(TABLE)
+    (tmp_path / "model.zip").write_text("")
+    motorway(tmp_path)
+    (tmp_path / "file").write_text("mine")
+    words, kept = COMMANDS[name]
+    is_one = kept is not None and (not kept or kept.startswith("."))
+    ending = kept if is_one else ""
+
+    def given(place):
+        option = "--records" if name == "record" else "--output"
+        return [*name.split(), *words, option, place]
+
+    here = sorted(tmp_path.iterdir())
+    assert "file" in refused(*given(f"file/below{ending}"))
+    if not is_one:
+        assert "file" in refused(*given("file"))
+    with monkeypatch.context() as patch:
+        patch.setattr(files.tempfile, "TemporaryFile", refuse)  # a mode binds no root
+        assert "must be a folder that can be written" in refused(*given(f"new{ending}"))
+    assert sorted(tmp_path.iterdir()) == here
+    if kept is not None:
+        taken = tmp_path / ("taken" if not is_one else f"taken{kept}")
+        mine = taken if is_one else taken / kept
+        mine.mkdir(parents=True)
+        words = [*words, "--force"] if "force" in run_command(*name.split(), "-h").stdout else words
+        assert str(mine) in refused(*given(taken))  # no force removes a folder
+        mine.rmdir()
+        words = COMMANDS[name][0]
+        mine.write_text("mine")
+        assert str(mine) in refused(*given(taken))
+        assert mine.read_text() == "mine"
+    with pytest.raises(BegunError):  # what was refused is the place alone
+        run_command(*given(f"new/below{ending}"))
