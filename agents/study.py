@@ -12,6 +12,7 @@ all are there, and taken up again after an interruption.
 from __future__ import annotations
 
 import hashlib
+import io
 import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +27,7 @@ from agents.executors import AnyExecutor, ThisProcess, run_shown
 from agents.play import Cell, corridor_of, play, record
 from agents.tables import are_present, numbers
 from dptse_env.traffic import Records
-from dptse_env.utils.files import replacing, write_atomically
+from dptse_env.utils.files import write_atomically
 from dptse_env.versions import code_version, numbers_of
 
 ROWS, TABLES = "rows.parquet", "tables.md"
@@ -258,5 +259,6 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
     Raises:
         OSError: It cannot be written; the old one stays.
     """
-    with replacing(path) as temporary:
-        table.write_parquet(temporary, compression="zstd", compression_level=19)
+    content = io.BytesIO()  # polars has an error of its own for a full disk
+    table.write_parquet(content, compression="zstd", compression_level=19)
+    write_atomically(path, content.getvalue())

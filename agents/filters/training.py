@@ -22,7 +22,6 @@ from agents.training.run_files import (
     Row,
     keep_plan,
     read_checkpoint,
-    read_progress,
     write_checkpoint,
     write_progress,
 )
@@ -131,7 +130,7 @@ class FilterTraining:
             self._optimiser.load_state_dict(checkpoint["optimiser"])
             self._average.load_state_dict(checkpoint["average"])
             self.done, self._seconds = checkpoint["done"], checkpoint["seconds"]
-            self.rows = [row for row in read_progress(folder) if row["update"] <= self.done]
+            self.rows = checkpoint["rows"]
             for row in self.rows:
                 self._watch(row)
 
@@ -146,6 +145,7 @@ class FilterTraining:
             while self.done < last:
                 self._pass(index, collected)
         self._save(WEIGHTS)
+        write_progress(self.folder, self.rows, COLUMNS)
 
     def _collect(self, index: int) -> list[Episodes]:
         name = self.plan.rounds[index].estimator
@@ -247,8 +247,8 @@ class FilterTraining:
         write_network(self.folder / name, self._average.weights(), card)
 
     def _keep(self) -> None:
-        write_progress(self.folder, self.rows, COLUMNS)
         content = {
+            "rows": self.rows,
             "network": self.network.state_dict(),
             "optimiser": self._optimiser.state_dict(),
             "average": self._average.state_dict(),
@@ -256,6 +256,7 @@ class FilterTraining:
             "seconds": self._seconds,
         }
         write_checkpoint(self.folder, content)
+        write_progress(self.folder, self.rows, COLUMNS)
 
     def _watch(self, row: Row) -> None:
         for watcher in self._watchers:

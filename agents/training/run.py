@@ -167,7 +167,8 @@ class Run:
         write_progress(self._folder, self.rows)
 
     def finish(self) -> None:
-        """Draw the curve, with the rules as lines."""
+        """Write the curve, and draw it with the rules as lines."""
+        write_progress(self._folder, self.rows)
         title = f"{self.plan.algorithm.name} in {self.plan.worlds[0]}, validation traffic"
         save_figure(draw_curve(self.rows, self.rules), self._folder / CURVE, title)
 

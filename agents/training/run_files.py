@@ -17,7 +17,7 @@ from dptse_env.utils.files import require_output, write_atomically
 
 PLAN, CHECKPOINT, PROGRESS = "plan.json", "checkpoint.pt", "progress.csv"
 
-FORMAT = 4
+FORMAT = 5
 """Format of the files; raise it whenever their content changes its meaning."""
 
 Row = dict[str, float]

@@ -267,7 +267,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path, whose file takes the place of `path` when the body is done.
 
     Raises:
-        OSError: The file cannot be written; the old one stays.
+        OSError: The file cannot be written, and the error names it; the old one stays.
     """
     target = Path(path)
     temporary = target.with_name(f".{target.name}-{uuid.uuid4().hex}")
@@ -276,6 +276,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         _take_place(temporary, target)
+    except OSError as problem:
+        problem.filename = os.fspath(target)  # a full disk names none, others the temporary one
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -348,7 +348,7 @@ def test_damaged_and_foreign_files_are_refused(whole, tmp_path):
     refused(PLAN, b'{"env', r"plan\.json must be JSON: ")
     refused(PLAN, None, "output must not exist yet, got ")
     older = json.loads((whole()[0] / PLAN).read_text()) | {"format": 3}
-    refused(PLAN, json.dumps(older).encode(), "format is 3 there and 4 now")
+    refused(PLAN, json.dumps(older).encode(), "format is 3 there and 5 now")
 
 
 # --- several trainings ----------------------------------------------------------------------------
