@@ -27,8 +27,8 @@ class Args(Machines, Environment):
     env: str = "dptse_env:dptse/PrivateHighway-v1"
     """Environment: an id, or an id and keywords as JSON, 'ID {"privacy": {"cap": 16}}'."""
     target: str = "worst-case"
-    """Vehicle that differs: worst-case, opposite, replaced, deleted, runs-out, jam or late; or
-    climbed, the worst one that a search from random trips and queries finds."""
+    """Vehicle that differs: worst-case, opposite, replaced or deleted; or climbed, the worst
+    one that a search from random trips and queries finds."""
     policy: str = "hunter"
     """Queries: hunter, adaptive, or a public schedule (paper, static, round-robin)."""
     runs: int = 5000

@@ -86,12 +86,14 @@ class Overheard(ReleaseModel):
     Attributes:
         model: The release model.
         last: Its last release.
+        means: What either world would have released without noise, shape (2, k, C, 2).
         heard: Score and squared distance of each column of it, shape (2, k, C).
         score: Log-likelihood ratio of world 1 of each run's transcript so far, shape (k,).
         square: Squared distance between the worlds' sums so far, in units of the noise, (k,).
     """
 
     last: Measurement
+    means: FloatArray
     heard: FloatArray
 
     def __init__(self, config: EnvConfig, worlds: Worlds, n: int, factor: float) -> None:
@@ -128,8 +130,15 @@ class Overheard(ReleaseModel):
         # Asked once: a prediction holds for its second alone.
         request = request._replace(prediction=cache(request.prediction))
         self.last = self.model.release(request)
+        stated = self.last.sigma[self.last.observed]
+        if not (stated > 0.0).all():
+            raise ValueError(
+                "the audit needs a release model that states positive deviations of its noise, got "
+                f"{stated.min():g} from {self.task.name!r}"
+            )
         sigma = self._factor * self.last.sigma
-        zero, one = (mean / sigma for mean in self._means(request))
+        self.means = self._both(request)
+        zero, one = self.means / sigma
         difference = np.where(self.last.observed[:, :, None], one - zero, 0.0)
         told = (self.last.values / sigma - 0.5 * (zero + one)) * difference
         self.heard = np.stack([told.sum(axis=2), np.sum(difference**2, axis=2)])
@@ -138,8 +147,8 @@ class Overheard(ReleaseModel):
         self.square[request.episodes] += square
         return self.last
 
-    def _means(self, request: Request) -> tuple[FloatArray, FloatArray]:
-        """Return what either world would release without noise, shape (k, C, 2) each."""
+    def _both(self, request: Request) -> FloatArray:
+        """Return what either world would release without noise, shape (2, k, C, 2)."""
 
         def predicted_twice() -> Estimate:
             return Estimate(*(np.concatenate([each, each]) for each in request.prediction()))
@@ -153,7 +162,7 @@ class Overheard(ReleaseModel):
             predicted_twice,
         )
         values = self._either.release(both).values
-        return values[:k], values[k:]
+        return values.reshape(2, k, *values.shape[1:])
 
     def _in_both(self, episodes: IntArray) -> IntArray:
         return np.concatenate([episodes, episodes + len(self.score)])

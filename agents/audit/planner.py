@@ -11,14 +11,13 @@ from agents.audit.attack import Queries, attack, overheard
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface, make_release
+from dptse_env.release import QueryOptions
 from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import Record
-from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import require
 
-KINDS: tuple[str, ...] = (
-    "worst-case", "opposite", "replaced", "deleted", "runs-out", "jam", "late",
-)  # fmt: skip
+KINDS = ("worst-case", "opposite", "replaced", "deleted")
 """Kinds of targets; see `Planner.choose`."""
 
 PUBLIC_SCHEDULES = ("paper", "static", "round-robin")
@@ -26,12 +25,6 @@ PUBLIC_SCHEDULES = ("paper", "static", "round-robin")
 
 POLICIES = ("hunter", "adaptive", *PUBLIC_SCHEDULES)
 """Names of the query policies."""
-
-JAM_SPEED = 10.0
-"""Speed below which a vehicle stands in a jam [km/h]."""
-
-LATE = 0.5
-"""Part of an episode after which a vehicle enters late."""
 
 SHORTLIST = 12
 """Partners to try for the best vehicle. The best partners stand in one jam and are alike, so the
@@ -52,6 +45,20 @@ def public_plan(config: EnvConfig, name: str) -> BoolArray:
     schedule = SCHEDULES.find(name)(interface)
     queried: BoolArray = schedule.select(steps, np.zeros((len(steps), size), dtype=np.float32))
     return queried
+
+
+def random_plan(
+    queries: QueryOptions, n: int, generator: np.random.Generator, first: BoolArray | None = None
+) -> BoolArray:
+    """Return as many random queries as can be paid for n times, some of them first, (n, G)."""
+    order = generator.random((n, queries.n_options))
+    if first is not None:
+        order -= first
+    ranked = np.argsort(order, axis=1)
+    paid = np.cumsum(queries.cost[ranked], axis=1) <= queries.bandwidth
+    plan = np.zeros(order.shape, dtype=bool)
+    np.put_along_axis(plan, ranked, paid, axis=1)
+    return plan
 
 
 class Planner:
@@ -114,10 +121,7 @@ class Planner:
                 vehicles of the record is there; ``worst-case``, a vehicle is added that stands
                 still, and in the other world stands elsewhere, drives by or is absent, whichever is
                 worst under the adjacency; ``opposite``, the part of it with two added vehicles on
-                one segment, as slow and as fast as can be. Of the record and replaced by another or
-                by none: ``runs-out``, the vehicle that tells least of what it could, since its
-                contributions are bounded, ``jam``, the one that stands longest, and ``late``, the
-                one that tells most of those that enter in the second half.
+                one segment, as slow and as fast as can be.
 
         Raises:
             ValueError: It is none of `kinds`, or the record holds too few vehicles.
@@ -146,8 +150,8 @@ class Planner:
         return found
 
     def _of_record(self, record: Record, kind: str) -> list[AdjacentWorlds]:
-        """Return worlds in which the best vehicle of a kind is replaced by others, or by none."""
-        ranked, alone = self.rank(record, kind), kind == "deleted" or not self.replaces
+        """Return worlds in which the best vehicle is replaced by others, or by none."""
+        ranked, alone = self.rank(record), kind == "deleted"
         need, n = 1 if alone else 2, len(ranked)
         require(n >= need, "traffic", f"a record of {need} observable vehicles", n)
         first = int(ranked[0])
@@ -166,8 +170,8 @@ class Planner:
             for other in others
         ]
 
-    def rank(self, record: Record, kind: str) -> IntArray:
-        """Return observable vehicles by what they tell, or by what their kind is about."""
+    def rank(self, record: Record) -> IntArray:
+        """Return observable vehicles by what they tell."""
         rows = np.flatnonzero(self._observable(record)[record.step, record.segment])
         rows = rows[np.lexsort((record.step[rows], record.vehicle[rows]))]
         step, segment = (column[rows].astype(np.int64) for column in (record.step, record.segment))
@@ -180,16 +184,7 @@ class Planner:
         trips = [slice(*ends) for ends in pairwise([*starts.tolist(), len(rows)])]
         asked = np.array([squares[trip].sum() for trip in trips])
         told = np.array([self._reach(squares[trip], always[trip]) for trip in trips])
-        suits: AnyArray = told
-        if kind == "runs-out":
-            suits = asked - told
-        elif kind == "jam":
-            suits = np.array([np.count_nonzero(speed[trip] < JAM_SPEED) for trip in trips])
-        elif kind == "late":
-            entered = np.full(record.n_vehicles, record.n_steps)
-            np.minimum.at(entered, record.vehicle, record.step)
-            suits = np.where(entered[vehicles] > LATE * self.config.horizon_steps, told, 0.0)
-        best: IntArray = vehicles[np.lexsort((-asked, -suits))]
+        best: IntArray = vehicles[np.lexsort((-asked, -told))]
         return best
 
     def _reach(self, squares: FloatArray, always: BoolArray) -> float:
@@ -265,7 +260,7 @@ class Planner:
         """Return the policy's queries, shape (horizon, G).
 
         A hunter follows the vehicle in both worlds, and queries it in the seconds that tell most,
-        within the bandwidth.
+        within the bandwidth; and after them, when a ledger should refuse it.
         """
         config = self.config
         if self.policy in PUBLIC_SCHEDULES:
@@ -277,13 +272,20 @@ class Planner:
             seconds, budget = self._worthwhile(worlds, world)
             candidates += seconds
             left.append(budget)
-        for _, step, segment, world in sorted(candidates):
-            option = self._option[segment]
+
+        def ask(step: int, option: int) -> bool:
             # Where both trajectories meet, one query serves both.
-            free = plan[step, option] or cost[plan[step]].sum() + cost[option] <= bandwidth
-            if left[world] and free:
-                plan[step, option] = True
+            plan[step, option] |= cost[plan[step]].sum() + cost[option] <= bandwidth
+            return bool(plan[step, option])
+
+        for _, step, segment, world in sorted(candidates):
+            if left[world] and ask(step, self._option[segment]):
                 left[world] -= 1
+        # Ledgers are spent by then, and should refuse the rest.
+        spent = int(np.flatnonzero(plan.any(axis=1)).max(initial=-1))
+        for _, step, segment, _ in candidates:
+            if step > spent:
+                ask(step, self._option[segment])
         if self._release.has_prices and self._is_whole:
             # What is left of the bandwidth goes round all segments. That keeps the estimator, and
             # so centres and prices, as they are in a typical episode.
@@ -293,7 +295,7 @@ class Planner:
         return plan
 
     def _worthwhile(self, worlds: AdjacentWorlds, world: int) -> tuple[list[Second], int]:
-        """Return the seconds in which to query a world's vehicle, and how many of them to take.
+        """Return the seconds in which to query a world's vehicle, and how many of them suffice.
 
         Those of the least cost are taken first.
         """
@@ -309,8 +311,8 @@ class Planner:
         else:
             squares, seen_always = self._squares_in(worlds, world)[seen], always[seen]
             _, n_queries, stop = plan_contributions(squares, seen_always, self._cap)
-            counts = ~seen_always & (np.arange(len(squares)) < stop)
-            chosen, costs = vehicle.only(seen).only(counts), -squares[counts]
+            costs = np.where(np.arange(len(squares)) < stop, -squares, 0.0)[~seen_always]
+            chosen = vehicle.only(seen).only(~seen_always)
         columns = costs.tolist(), (chosen.step - 1).tolist(), chosen.segment.tolist()
         return [(*second, world) for second in zip(*columns, strict=True)], n_queries
 

@@ -8,11 +8,12 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from agents.audit.attack import attack
 from agents.audit.one_run import KINDS, attack_in_one_run
 from agents.audit.planner import Planner
+from agents.audit.residuals import NoiseTest, examine, residuals_of
 from agents.audit.search import CLIMBED, climb
 from agents.audit.statistics import (
     AuditResult,
@@ -46,6 +47,7 @@ class Finding:
         distance: Largest distance between the worlds' true sums, in units of the noise: the
             largest mu that this attack can show. For one run, the distance at which equal canaries
             would expect as many errors.
+        noise: The test of the noise of some other episodes.
     """
 
     title: str
@@ -54,8 +56,14 @@ class Finding:
     noise_factor: float
     distance: float
     result: AuditResult
+    noise: NoiseTest
     privacy: PrivacyReport
     seconds: float
+
+    @property
+    def verdict(self) -> Literal["rejected", "not rejected"]:
+        """``rejected`` if a bound lies above the claim, or the noise is not as stated."""
+        return "rejected" if self.noise.is_rejected else self.result.verdict
 
     @property
     def gaussian_epsilon(self) -> float:
@@ -112,20 +120,24 @@ class Finding:
         else:
             few = "canaries" if result.is_one_run else "runs"
             print_text(f"too few {few} to reject this claim, however much leaks")
-        if result.mu_of_any is not None:
-            print_text(f"lower bound on mu for dependent noise: {result.mu_of_any:.3f}")
+        print_text(
+            f"noise: {'rejected' if self.noise.is_rejected else 'not rejected'} by "
+            f"{self.noise.n} residuals of other episodes, p = {self.noise.p_value:.2g}; "
+            f"most suspect: {self.noise.suspect}"
+        )
         if "boundary_inputs" in self.privacy.void_reasons:
             print_text(
                 'only the releases were attacked: boundary_inputs is "true", so the estimates use '
                 "the true traffic at the boundary, and their epsilon is infinite"
             )
-        print_text(f"verdict: {result.verdict}, at confidence {result.confidence:.0%}")
+        print_text(f"verdict: {self.verdict}, at confidence {result.confidence:.0%}")
 
     def write(self, path: Path, arguments: Mapping[str, Any]) -> None:
         """Write the finding to a JSON file, with its origin."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         content = fields | {
-            "verdict": self.result.verdict,
+            "verdict": self.verdict,
+            "noise": dataclasses.asdict(self.noise),
             "result": dataclasses.asdict(self.result),
             "gaussian_epsilon": self.gaussian_epsilon,
             "power": self.power,
@@ -151,7 +163,7 @@ def audit_environment(
     seed: int = 0,
     executor: AnyExecutor = THIS_PROCESS,
 ) -> Finding:
-    """Choose two worlds, play both, and test the claim to users.
+    """Test the noise, choose two worlds, play both, and test the claim to users.
 
     Args:
         config: The configuration under attack, of `agents.environments.make_config`.
@@ -169,11 +181,11 @@ def audit_environment(
 
     Raises:
         ValueError: A kind or policy is unknown or does not suit the environment, the record has too
-            few vehicles, or the release model does not add its noise by a
-            `dptse_env.release.noise.Noise`.
+            few vehicles, or the release model cannot be checked (`residuals_of`).
     """
     check_target(config, target, policy)
     report, start = privacy_report(config), time.perf_counter()
+    noise = examine(residuals_of(config, record, noise_factor=noise_factor, seed=seed))
     if target == CLIMBED:
         options: dict[str, Any] = {"policy": policy, "seed": seed, "executor": executor}
         worlds, queries = climb(config, record, rounds, **options)
@@ -198,6 +210,7 @@ def audit_environment(
         noise_factor=noise_factor,
         distance=float(runs.distances.max()),
         result=audit(runs.scores[0], runs.scores[1], claim, confidence),
+        noise=noise,
         privacy=report,
         seconds=time.perf_counter() - start,
     )
@@ -211,9 +224,9 @@ def audit_one_run(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> Finding:
-    """Test the claim to users on one episode with many canaries.
+    """Test the noise, and the claim to users on one episode with many canaries.
 
-    `agents.audit.statistics` has what the verdict rests on: the noise of different numbers is
+    `agents.audit.statistics` has what the bound rests on: the noise of different numbers is
     independent by the claim.
 
     Args:
@@ -224,10 +237,10 @@ def audit_one_run(
         seed: Seeds coins and noise, >= 0.
 
     Raises:
-        ValueError: The release model does not add its noise by a
-            `dptse_env.release.noise.Noise`.
+        ValueError: The release model cannot be checked (`residuals_of`).
     """
     report, start = privacy_report(config), time.perf_counter()
+    noise = examine(residuals_of(config, record, noise_factor=noise_factor, seed=seed))
     run = attack_in_one_run(config, record, noise_factor=noise_factor, seed=seed)
     return Finding(
         title=_title(report),
@@ -236,6 +249,7 @@ def audit_one_run(
         noise_factor=noise_factor,
         distance=run.distance,
         result=audit_coins(run.scores, run.coins, claim_of(report), confidence),
+        noise=noise,
         privacy=report,
         seconds=time.perf_counter() - start,
     )

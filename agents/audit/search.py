@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from agents.audit.attack import Queries, overheard
-from agents.audit.planner import PUBLIC_SCHEDULES, Planner, public_plan
+from agents.audit.planner import PUBLIC_SCHEDULES, Planner, public_plan, random_plan
 from agents.audit.worlds import AdjacentWorlds, Trajectory, Worlds
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
 from dptse_env.config import EnvConfig
@@ -80,7 +80,7 @@ class Mutations:
         pair = Pair(
             np.full((2, T), -1),
             np.zeros((2, T)),
-            self._random_plan(T, generator) if self.plan is None else self.plan,
+            random_plan(self._queries, T, generator) if self.plan is None else self.plan,
         )
         for _ in range(20):
             pair = self._other_stay(pair, self._window(generator), generator)
@@ -124,7 +124,8 @@ class Mutations:
         there = np.where(follows, pair.place[:, at], -1)
         covers = self._covers[: self._queries.n_options]
         sees = covers[:, there] & (there >= 0)
-        plan[at] = self._random_plan(len(at), generator, first=(sees[:, 0] | sees[:, 1]).T)
+        first = (sees[:, 0] | sees[:, 1]).T
+        plan[at] = random_plan(self._queries, len(at), generator, first)
         return replace(pair, plan=plan)
 
     def _one_second(self, pair: Pair, generator: np.random.Generator) -> Pair:
@@ -135,19 +136,6 @@ class Mutations:
             place[trip, second] = generator.choice(self._places)
             speed[trip, second] = self._speed(generator)
         return replace(pair, place=place, speed=speed)
-
-    def _random_plan(
-        self, T: int, generator: np.random.Generator, first: BoolArray | None = None
-    ) -> BoolArray:
-        """Return as many random queries as can be paid for, some of them first, shape (T, G)."""
-        order = generator.random((T, self._queries.n_options))
-        if first is not None:
-            order -= first
-        ranked = np.argsort(order, axis=1)
-        paid = np.cumsum(self._queries.cost[ranked], axis=1) <= self._queries.bandwidth
-        plan = np.zeros(order.shape, dtype=bool)
-        np.put_along_axis(plan, ranked, paid, axis=1)
-        return plan
 
     def _trip(self, generator: np.random.Generator) -> int:
         return int(generator.integers(self._n_trips))

@@ -30,17 +30,15 @@ the further noise, every guess is fixed, and the coins are independent: he errs 
 least the probability e(X) with which the best guess errs that knows X alone. The e(X) are
 independent, and each has the mean $\Phi(-\mu/2)$. $\square$
 
-Rejected is therefore the claim with its independence. Without it, errors can come together: one
-number drawn for all canaries would make all guesses right, or all wrong. A bound that holds for any
-mechanism that is $\mu$-Gaussian differentially private for each canary, given the others, is some
-40 % as large (Mahloujifar, Melis and Chaudhuri 2024; `mu_of_any`).
+Rejected is therefore the claim with its independence, which `agents.audit.residuals` tests. Without
+it, errors can come together: one number drawn for all canaries would make all guesses right, or all
+wrong.
 
 An audit can refute a claim and never prove one. Nothing here depends on traffic.
 """
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -117,7 +115,6 @@ class AuditResult:
         epsilon: lower bound on epsilon at the claim's delta, for any mechanism. A large
             epsilon shows in rare errors only, so the bound lies well below the truth. None for
             one run.
-        mu_of_any: for one run, the lower bound on mu that holds where noise depends, too.
         confidence: probability with which both bounds hold together.
         n: runs in each world, or canaries of the one run.
     """
@@ -127,7 +124,6 @@ class AuditResult:
     epsilon: LowerBound | None
     confidence: float
     n: int
-    mu_of_any: float | None = None
 
     @property
     def is_one_run(self) -> bool:
@@ -209,32 +205,7 @@ def audit_coins(
     errors, n = int(np.count_nonzero((told > 0.0) != thrown)), told.size
     rate = float(error_bound(errors, n, risk))
     bound = LowerBound(max(-2.0 * float(ndtri(rate)), 0.0), 0.0, rate, rate)
-    return AuditResult(claim, bound, None, confidence, n, mu_of_any(errors, n, risk))
-
-
-@cache
-def mu_of_any(errors: int, n: int, risk: float) -> float:
-    r"""Lower bound on mu from the errors at n canaries, whether or not they are independent.
-
-    Let $q_j$ be the probability of j right guesses, $r_i = \sum_{j \ge i} q_j j / n$ that of i or
-    more of them with a random canary's among them, and $h_i = \sum_{j \ge i} q_j (n - j) / n$ that
-    of i or more without. With the other coins as they are, the same transcripts make a random
-    canary's guess right under the one coin and wrong under the other, so that the trade-off curve
-    gives $h_{i-1} \ge \Phi(\Phi^{-1}(r_i) - \mu)$. Least probability is needed where each $h$ is
-    as small as it can be, from the number of right guesses down. Where it exceeds 1, so many right
-    guesses have a probability below `risk` (Mahloujifar, Melis and Chaudhuri 2024).
-    """
-    right = n - errors
-
-    def excess(mu: float) -> float:
-        r, h = risk * right / n, risk * errors / n
-        for i in range(right - 1, -1, -1):
-            least = max(h, float(ndtr(ndtri(min(r, 1.0)) - mu)))
-            r, h = r + (least - h) * i / (n - i), least
-        return r + h - 1.0
-
-    # Beyond it one canary shows nothing more in double precision.
-    return float(brentq(excess, 0.0, 40.0)) if right and excess(0.0) > 0.0 else 0.0
+    return AuditResult(claim, bound, None, confidence, n)
 
 
 def error_bound(errors: npt.ArrayLike, trials: int, risk: float) -> FloatArray:

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from agents.audit.residuals import RISK, examine
 from dptse_env.release import noise as module
 from dptse_env.release.noise import (
     BLOCK,
@@ -25,7 +26,7 @@ from dptse_env.release.noise import (
     rounded_normal,
 )
 
-from .worlds import ONE, residual_faults, streams
+from .worlds import ONE, streams
 
 SIGMA = np.array([20.3, 11.2])
 S = 19
@@ -63,11 +64,11 @@ def smoothed(block):
 
 
 FAULTS = {
-    "variance of density": lambda block: 1.05 * block,
-    "variance of speed": lambda block: block * [1.0, 0.95],
-    "correlation: density and speed": lambda block: block[..., [0, 0]],
-    "correlation: lag 1": smoothed,
-    f"correlation: lag {BLOCK}": lambda block: np.random.default_rng(1).normal(size=block.shape),
+    "stated deviation in quantity density": lambda block: block * [0.95, 1.0],
+    "stated deviation in quantity speed": lambda block: block * [1.0, 0.95],
+    "0 columns and 1 quantities further, 0 s later": lambda block: block[..., [0, 0]],
+    "0 columns and 0 quantities further, 1 s later": smoothed,
+    f"{BLOCK} s later": lambda block: np.random.default_rng(1).normal(size=block.shape),
     None: lambda block: block,
 }
 """Blocks as a wrong `Noise` draws them, by the symptom."""
@@ -85,8 +86,12 @@ def test_residuals_are_white_and_of_the_stated_size_and_those_of_a_fault_are_not
     noise = started(0, kind=Faulty)
     truth = np.random.default_rng(99).uniform(0.0, 300.0, (550, 1, S, 2))
     released = np.stack([added(noise, values) for values in truth])
-    faults = residual_faults(truth[:, 0], released[:, 0], SIGMA)
-    assert symptom in faults if symptom else faults == []
+    residuals = ((released - truth) / SIGMA)[:, 0]
+    found = examine(residuals)
+    assert found.is_rejected == (symptom is not None)
+    assert symptom is None or symptom in found.suspect
+    # Nor are they larger than stated, or biased.
+    assert symptom or stats.kstest(residuals.ravel(), "norm").pvalue > RISK
 
 
 # --- the distribution ------------------------------------------------------------------------

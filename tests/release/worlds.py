@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy import stats
 
 from dptse_env.estimators import Estimate
 from dptse_env.release import RELEASE_MODELS, Group, QueryOptions, Request, Task, Traffic
@@ -102,30 +101,6 @@ def request(time, observed=True, prediction=None, episodes=(0,), n_columns=COLUM
         episodes, episodes, np.full(len(episodes), time), flags,
         prediction or predicting(n_episodes=len(episodes)),
     )  # fmt: skip
-
-
-def residual_faults(true, released, sigma, max_lag=100):
-    """Name each way in which (released - true) / sigma, (steps, S, 2), is not white and normal.
-
-    Two-sided, at a total level of about 1e-4: chi-square for the variance of each quantity, and
-    normal bounds on the mean, and on the mean product of residuals at each lag, of neighbouring
-    segments and of the two quantities.
-    """
-    residuals = (released - true) / np.asarray(sigma)
-    faults = []
-    for quantity, values in (("density", residuals[..., 0]), ("speed", residuals[..., 1])):
-        tail = stats.chi2(values.size).cdf((values**2).sum())
-        if not 1e-5 < tail < 1.0 - 1e-5:
-            faults.append(f"variance of {quantity}")
-        if not abs(values.sum()) < 5.0 * np.sqrt(values.size):
-            faults.append(f"mean of {quantity}")
-    pairs = {f"lag {k}": (residuals[k:], residuals[:-k]) for k in range(1, max_lag + 1)}
-    pairs["neighbours"] = (residuals[:, 1:], residuals[:, :-1])
-    pairs["density and speed"] = (residuals[..., 0], residuals[..., 1])
-    for name, (left, right) in pairs.items():
-        if not abs((left * right).sum()) < 5.0 * np.sqrt(left.size):
-            faults.append(f"correlation: {name}")
-    return faults
 
 
 # --- trips that differ in one vehicle -----------------------------------------------------------

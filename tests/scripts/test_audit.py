@@ -30,14 +30,18 @@ def test_a_guarantee_is_not_rejected_and_too_little_noise_is(tmp_path, capsys):
     assert found["result"]["claim"] == {"mu": pytest.approx(mu), "epsilon": 5.0, "delta": 0.05}
     assert 0.0 < found["result"]["mu"]["value"] <= mu
     assert found["privacy"]["void_reasons"] == []
+    noise = found["noise"]
+    assert noise["p_value"] > 1e-3
     printed = capsys.readouterr().out
-    for number in (f"{mu:.3f}", f"{found['result']['mu']['value']:.3f}", f"{found['power']:.4f}"):
+    for number in (f"{mu:.3f}", f"{found['result']['mu']['value']:.3f}", f"{found['power']:.4f}",
+                   f"noise: not rejected by {noise['n']} residuals", noise["suspect"]):  # fmt: skip
         assert number in printed
     name, weak = run(tmp_path / "weak", noise_factor=0.4)
     assert name == "capped-worst-case-hunter-noise-0.4.json"
     assert weak["verdict"] == "rejected"
     assert weak["distance"] == pytest.approx(2.5 * mu)
     assert weak["result"]["mu"]["value"] > mu
+    assert weak["noise"]["p_value"] < 1e-10
 
 
 def test_what_the_paper_promises_is_rejected_with_vehicles_of_the_record(tmp_path):
@@ -46,6 +50,16 @@ def test_what_the_paper_promises_is_rejected_with_vehicles_of_the_record(tmp_pat
     # The claim to users, not the account.
     assert found["result"]["claim"]["mu"] == pytest.approx(mu_of(1.0, 0.05))
     assert "boundary_inputs" in found["privacy"]["void_reasons"]
+
+
+def test_what_the_noise_alone_betrays_is_rejected(tmp_path, capsys):
+    privacy = {"preset": "tests.agents.audit.mechanisms:SharedNoise", "epsilon": 5.0}
+    _, found = run(tmp_path, privacy, runs=20)
+    assert found["result"]["mu"]["value"] < found["result"]["claim"]["mu"]
+    assert found["verdict"] == "rejected"
+    printed = capsys.readouterr().out
+    assert "noise: rejected by " in printed
+    assert "verdict: rejected" in printed
 
 
 class Unstated(Paper):

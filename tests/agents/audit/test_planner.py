@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.audit.planner import JAM_SPEED, KINDS, Planner, plan_contributions, public_plan
+from agents.audit.planner import KINDS, Planner, plan_contributions, public_plan
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.parts import privacy_report
 from tests.helpers import fast_and_slow
@@ -132,8 +132,7 @@ FEW = [
     ("replaced", config(boundary_inputs="private"), "hunter"),
     ("worst-case", paced("random_walk", adjacency="add_remove", ratio=20.0), "hunter"),
     ("opposite", paced("random_walk", clip=5.0, ratio=0.1), "hunter"),
-    ("runs-out", paced("random_walk", pace=0.05), "round-robin"),
-    ("jam", paced("random_walk", unit="event"), "hunter"),
+    ("deleted", paced("random_walk", unit="event"), "hunter"),
 ]
 ALL = [
     (kind, setting, policy)
@@ -192,26 +191,6 @@ def test_a_replaced_vehicle_tells_more_than_a_deleted_one(record):
         assert replaced > 1.2 * deleted
 
 
-def test_targets_of_the_record_are_what_they_are_called(record):
-    planner = Planner(paced())
-    whole = {kind: planner.rank(record, kind).tolist() for kind in KINDS}
-    jammed = [np.sum(record.speed[record.vehicle == v] < JAM_SPEED) for v in whole["jam"]]
-    assert jammed == sorted(jammed, reverse=True)
-    first = [record.step[record.vehicle == v].min() for v in range(record.n_vehicles)]
-    late = [v for v in whole["late"] if first[v] > HORIZON / 2]
-    assert whole["late"][: len(late)] == late != []
-    # With the largest unpaid demand: more seconds than the two that count.
-    road = dataclasses.replace(ROAD, fixed_sensors=())
-    capped = Planner(dataclasses.replace(config(cap=2), corridor=road))
-    paths = [Trajectory.from_record(record, v) for v in capped.rank(record, "runs-out")]
-    squares = [np.sort(np.sum(capped.moves(record, path) ** 2, axis=1)) for path in paths]
-    assert np.diff([each[:-2].sum() for each in squares]).max() <= 1e-9
-    # It would pay on if its ledger held more.
-    worlds = planner.choose(record, "runs-out")
-    rich = paced(epsilon=1e4)
-    assert reached(rich, worlds) * privacy_report(rich).mu > 1.2 * privacy_report(paced()).mu
-
-
 @pytest.mark.parametrize(
     ("setting", "kind"),
     [
@@ -243,7 +222,10 @@ def test_the_hunter_keeps_to_bandwidth_and_cap(bandwidth, record):
     worlds = AdjacentWorlds(record, (staying(0), staying(1)))
     plan = Planner(setting).plan(worlds)
     assert plan.sum(axis=1).max() <= bandwidth
-    assert plan.sum() == 14  # seven for each of the two paths
+    # Seven for each of the two paths tell the whole of mu; then a ledger has to refuse.
+    n_spent = 7 if bandwidth > 1 else 14
+    assert plan[:n_spent, :2].sum() == 14
+    assert plan[n_spent:].any(axis=1).all()
     assert reached(setting, worlds) == pytest.approx(1.0)
 
 
@@ -254,8 +236,9 @@ def test_the_hunter_queries_the_seconds_that_reveal_most(record):
     free = path.only(path.segment < 5)
     best = free.step[np.argsort(-np.abs(np.clip(free.speed, 0, 102) - 51.0))[:3]]
     plan = Planner(config(cap=3)).plan(worlds)
-    assert set(np.flatnonzero(plan.any(axis=1)) + 1) == set(best.tolist())
-    assert plan.sum() == 3
+    later = free.step[free.step > best.max()]
+    assert set(np.flatnonzero(plan.any(axis=1)) + 1) == {*best.tolist(), *later.tolist()}
+    assert plan.sum() == 3 + later.size > 3
 
 
 def test_the_hunter_queries_where_the_two_trajectories_part(record):
@@ -266,7 +249,7 @@ def test_the_hunter_queries_where_the_two_trajectories_part(record):
     paths = tuple(map(Trajectory, (seconds, seconds), together, speeds))
     plan = Planner(config(bandwidth=2, cap=4)).plan(AdjacentWorlds(record, paths))
     assert plan[:10].sum() == 0
-    assert plan[10:20, [2, 3]].sum() == plan.sum() == 8
+    assert plan[10:20, [2, 3]].sum() == plan.sum() == 20
 
 
 @pytest.mark.parametrize("bandwidth", [1, 2, 5])

@@ -10,7 +10,6 @@ from agents.audit.statistics import (
     audit_coins,
     detectable_mu,
     error_bound,
-    mu_of_any,
     rejection_probability,
 )
 from dptse_env.privacy import epsilon_of, mu_of
@@ -71,32 +70,6 @@ def test_the_power_of_one_run_is_its_rate_of_rejection(mu, n):
     assert np.mean(rejected) == pytest.approx(power, abs=4.0 * math.sqrt(0.25 / 1_000))
     least = detectable_mu(0.75, n, is_one_run=True)
     assert rejection_probability(least, 0.75, n, is_one_run=True) == pytest.approx(0.95, abs=1e-3)
-
-
-def test_a_bound_holds_where_all_canaries_share_one_noise():
-    mu, n, above = 2.118, 60, [0, 0]
-    for seed in range(300):
-        generator = np.random.default_rng(seed)
-        coins = generator.integers(2, size=n)
-        scores = (2 * coins - 1) * (0.5 * mu**2 + mu * generator.standard_normal())
-        result = audit_coins(scores, coins, claim_at(mu))
-        above[0] += result.mu.value > mu
-        above[1] += result.mu_of_any > mu
-    assert above[0] > 200
-    assert above[1] <= 24
-
-
-def test_the_bound_for_any_mechanism_is_where_probabilities_exceed_one():
-    """Against the recursion for two canaries, by hand."""
-    bound = mu_of_any(0, 2, 0.4)
-    # Both right: q_2 = 0.4. One right, one wrong: h_1 = q_1 / 2. None right: h_0 = h_1 + q_0.
-    one = 2.0 * norm.cdf(norm.ppf(0.4) - bound)
-    none = norm.cdf(norm.ppf(0.4 + one / 2.0) - bound) - one / 2.0
-    assert 0.4 + one + none == pytest.approx(1.0)
-    for errors, n in ((0, 20), (2, 50), (10, 60)):
-        independent = -2.0 * norm.ppf(error_bound(errors, n, 0.05))
-        assert 0.2 * independent < mu_of_any(errors, n, 0.05) < 0.6 * independent
-    assert mu_of_any(5, 10, 0.05) == mu_of_any(10, 10, 0.05) == 0.0
 
 
 def test_few_canaries_reject_nothing():
