@@ -20,7 +20,6 @@ import io
 import json
 import math
 import multiprocessing
-import re
 import shutil
 import sys
 import tempfile
@@ -66,7 +65,7 @@ from tests.importers.test_tables import text_of_ngsim
 LONGEST = 60.0
 """Processor time of a case [s]; those that are in order take a few seconds."""
 MEMORY = 500 * 2**20
-"""Bytes of a case beyond those of the process before."""
+"""Bytes of a case beyond the most that the process took before."""
 GUARD = 16 * 2**30
 """Bytes that a process may reserve, so that a case does not take all of the machine's."""
 PATIENCE = 600.0
@@ -420,7 +419,7 @@ def verdict(use, place):
         use: What is tried.
         place: The file, or what a message may begin with.
     """
-    began, before = time.process_time(), resident("VmRSS", reset=True)
+    began, before = time.process_time(), peak()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -432,23 +431,20 @@ def verdict(use, place):
         line = " ".join(traceback.format_exception_only(problem)[-1].split())
         where = traceback.extract_tb(problem.__traceback__)[-1]
         said = f"escaped: {line:.300} ({where.filename}:{where.lineno})"
-    took, more = time.process_time() - began, resident("VmHWM") - before
+    took, more = time.process_time() - began, peak() - before
     if took > LONGEST or more > MEMORY:
         return f"escaped: it took {took:.1f} s and {more / 2**20:.0f} MB, {said:.200}"
     return said
 
 
-def resident(name, reset=False):
-    """Return the memory [bytes] of this process, now (VmRSS) or at its peak since a reset (VmHWM).
-
-    Elsewhere than on Linux it is 0.
-    """
-    status = Path("/proc/self/status")
-    if not status.exists():
+def peak():
+    """Return the largest memory of this process so far [bytes], 0 on Windows."""
+    if sys.platform == "win32":
         return 0
-    if reset:
-        Path("/proc/self/clear_refs").write_text("5")
-    return 1024 * int(re.search(rf"{name}:\s+(\d+)", status.read_text())[1])
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def judged(message, place):

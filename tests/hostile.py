@@ -6,7 +6,6 @@ Damage is to any file with a card, or to any text. `tests/fuzz.py` draws it at r
 import copy
 import json
 import os
-import pickle
 import re
 
 import numpy as np
@@ -113,7 +112,7 @@ def packed(header, data):
 
 
 def damaged(content, flips=100, cuts=20):
-    """Damage that no file survives, by kind; large files are made of holes by `write`."""
+    """Damage that no file survives, by kind."""
     rng = np.random.default_rng(0)
     for place, bit in zip(rng.integers(len(content), size=flips), range(flips), strict=True):
         flipped = bytearray(content)
@@ -127,35 +126,18 @@ def damaged(content, flips=100, cuts=20):
     header = json.loads(text)
     arrays = {name: entry for name, entry in header.items() if name != "__metadata__"}
     first, entry = next(iter(arrays.items()))
-    begin, end = entry["data_offsets"]
-
-    def with_entry(**changes):
-        return packed({**header, first: {**entry, **changes}}, data)
 
     def with_card(card):
         return packed({**header, "__metadata__": {"card": card}}, data)
 
-    yield "longer", content + bytes(4)
     yield "zip", b"PK\x03\x04" + bytes(100)
-    yield "pickle", pickle.dumps(print)
     yield "header-of-100-MB", (10**8).to_bytes(8, "little") + content[8:]
-    yield "header-without-end", b"\xff" * 8 + content[8:]
-    yield "header-is-a-list", packed([header], data)
     yield "header-deep", packed(b'{"a":' * 200_000, data)
-    yield "header-of-digits", packed(b'{"a":' + b"9" * 10**6 + b"}", data)
     yield (
         "key-twice",
         packed(text.rstrip()[:-1] + f',"{first}":{json.dumps(entry)}}}'.encode(), data),
     )
-    yield "overlap", packed({**header, "again": entry}, data)
-    yield "gap", packed({**header, "last": {**entry, "data_offsets": [len(data) + 4, 0]}}, data)
-    yield "outside", with_entry(data_offsets=[begin, 2**40])
-    yield "negative-offset", with_entry(data_offsets=[-4, end])
-    yield "large-shape", with_entry(shape=[2**40, 2**40])
-    yield "huge-number", with_entry(shape=[10**4000])
-    yield "many-dimensions", with_entry(shape=[1] * 200_000)
-    yield "bfloat16", with_entry(dtype="BF16")
-    yield "unknown-type", with_entry(dtype="PICKLE")
+    yield "bfloat16", packed({**header, first: {**entry, "dtype": "BF16"}}, data)
     yield "no-card", packed(arrays, data)
     yield "card-is-a-number", packed({**header, "__metadata__": {"card": 1}}, data)
     yield "card-is-a-list", with_card("[]")

@@ -132,20 +132,6 @@ def test_a_task_whose_worker_died_runs_again_three_times(monkeypatch):
     assert Mortal.deaths == 0
 
 
-def dies_once(task):
-    number, trace = task
-    if number == 3 and not trace.exists():
-        trace.touch()
-        os.kill(os.getpid(), 9)
-    return number
-
-
-@pytest.mark.slow
-def test_a_worker_that_dies_is_replaced(tmp_path):
-    tasks = [(number, tmp_path / "trace") for number in range(8)]
-    assert run(LocalProcesses(2), dies_once, tasks) == list(range(8))
-
-
 PROGRAM = """
 import sys
 from agents.executors import LocalProcesses, run_in_order

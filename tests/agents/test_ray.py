@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.executors import THIS_PROCESS, ExecutorError, RayCluster, run_in_order
+from agents.executors import ExecutorError, RayCluster, run_in_order
 from agents.study import Place, run
 from dptse_env.traffic.library import CACHE_VARIABLE
 from tests.agents.faults import TRACES, rows_of, study
@@ -39,22 +39,6 @@ def cluster(ray):
     with contextlib.suppress(Exception):
         ray.shutdown()
     made.shutdown()
-
-
-@pytest.fixture
-def traces(tmp_path, monkeypatch):
-    """Let the faults of the study befall, and leave traces in a folder."""
-    folder = tmp_path / "traces"
-    folder.mkdir()
-    monkeypatch.setenv(TRACES, str(folder))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def expected(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("undisturbed")
-    run(study(), Place(folder, THIS_PROCESS), progress=False)
-    return rows_of(folder)
 
 
 def add_nodes(cluster, traces, n):

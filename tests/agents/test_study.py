@@ -12,7 +12,7 @@ from agents.study import Place, Study, read_rows, run, write_report, write_table
 from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, values
 from dptse_env import versions
 from dptse_env.estimators.recurrent import read_network
-from tests.agents.faults import SHORT, TRACES, rows_of, study
+from tests.agents.faults import SHORT, rows_of, study
 from tests.helpers import run_killed, save_untrained
 
 KEYWORDS = {"estimator": "random_walk", "horizon": 80}
@@ -178,21 +178,6 @@ def test_pairs_are_of_equal_numbers(monkeypatch):
         pick(x, {})
     monkeypatch.setattr(versions, "equal_digests", lambda: {"x": "x", "y": "x"})
     assert difference(pl.concat([x.filter(**b), y]), b, a, "error").mean == pytest.approx(0.0)
-
-
-@pytest.fixture(scope="module")
-def expected(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("undisturbed")
-    run(study(), Place(folder, THIS_PROCESS), progress=False)
-    return rows_of(folder)
-
-
-@pytest.fixture
-def traces(tmp_path, monkeypatch):
-    folder = tmp_path / "traces"
-    folder.mkdir()
-    monkeypatch.setenv(TRACES, str(folder))
-    return folder
 
 
 @pytest.mark.slow
