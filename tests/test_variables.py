@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from tests.helpers import ROOT
+
 PROGRAM = """
 import gymnasium as gym
 from agents.terminal import make_table, print_table
@@ -31,7 +33,7 @@ def test_variables_change_colours_and_the_place_of_records_but_no_number(
     exec(PROGRAM, {})
     expected = capsys.readouterr().out
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True,
+        [sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, check=True,
         env={**os.environ, **variables, "DPTSE_CACHE": str(tmp_path)}, encoding="utf-8",
     )  # fmt: skip
     assert len(list(tmp_path.rglob("*.safetensors"))) == 1

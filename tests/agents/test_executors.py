@@ -21,7 +21,7 @@ from agents.executors import (
 )
 from dptse_env.utils.kernels import compiling_is_said
 from dptse_env.utils.registry import MissingExtraError
-from tests.helpers import wait_for
+from tests.helpers import ROOT, wait_for
 
 
 def run(executor, work, tasks):
@@ -151,7 +151,7 @@ while {forever} or len(list(folder.iterdir())) < 2:
 def test_what_still_runs_is_ended_where_another_fails_or_the_program_is_killed(tmp_path, one_fails):
     tasks = [TASK.format(folder=str(tmp_path), forever=each) for each in (True, not one_fails)]
     command = [sys.executable, "-c", PROGRAM, *tasks]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as program:
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as program:
         try:
             if not one_fails:
                 wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
