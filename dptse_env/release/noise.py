@@ -288,8 +288,14 @@ class Noise:
 _SECURE: weakref.WeakSet[Noise] = weakref.WeakSet()
 """The secure noise that this process has drawn, which is not a forked one's to use."""
 
+
+def _forget_secure() -> None:
+    for noise in _SECURE:
+        noise._forget()
+
+
 if hasattr(os, "register_at_fork"):  # Windows has no forks
-    os.register_at_fork(after_in_child=lambda: [noise._forget() for noise in _SECURE])
+    os.register_at_fork(after_in_child=_forget_secure)
 
 
 @kernel
