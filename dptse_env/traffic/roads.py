@@ -252,7 +252,7 @@ def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[s
     for name in _WITH_FOLDER:
         given = fields.get(name)
         if isinstance(given, Mapping) and isinstance(given.get("folder"), str):
-            folder = str((path.parent / given["folder"]).absolute())
+            folder = str((path.parent / given["folder"]).resolve())
             fields[name] = {**given, "folder": folder}
     if "name" not in fields:
         fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")

@@ -271,6 +271,11 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
     write_corridor(folder / "road.toml", corridor)
     assert str(tmp_path) not in (folder / "road.toml").read_text()
     assert read_corridor(folder / "road.toml") == corridor
+    beside = tmp_path / "roads" / "road.toml"
+    beside.parent.mkdir()
+    write_corridor(beside, corridor)
+    assert 'folder = "../here"' in beside.read_text()
+    assert read_corridor(beside) == corridor
     moved = read_corridor(folder.rename(there) / "road.toml")
     assert Path(moved.network.folder) == there
     assert moved.digest == road.corridor.digest
