@@ -83,3 +83,15 @@ def test_a_mainline_that_nobody_drives_on_is_told(tmp_path):
     with pytest.raises(ValueError, match="files must be with vehicles on the mainline"):
         run(path, source, dataclasses.replace(ROAD, on_ramps=(3,), off_ramps=(), exit_shares=()))
     assert {each.name for each in tmp_path.iterdir()} == {"a.csv", "first", "b.csv"}
+
+
+def test_windows_that_begin_empty_are_told(tmp_path):
+    points = stream(seconds=45.0)
+    early = points[:, 1] < 5.0
+    kept = ~early | (points[:, 2] < 90.0)  # at first all are on the ramp, which joins at 100 m
+    path = plain(tmp_path / "a.csv", points[kept], lane=np.where(early, 7, 1)[kept])
+    lanes = Layout(mainline=Part(lanes=(1,)), on_ramps=(Part(lanes=(7,)),))
+    source = Source("table", {**PLAIN.columns, "lane": "lane"}, layout=lanes)
+    notes = run(path, source, ROAD).report["notes"]
+    assert "windows begin on an empty mainline: traffic seeds 0" in notes
+    assert "- note: windows begin" in (tmp_path / "imported" / "report.md").read_text()
