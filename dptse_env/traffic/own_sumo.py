@@ -431,7 +431,7 @@ def copy_input(path: Path, copy: Path, begin: float) -> Copied:
                         text = ElementTree.tostring(element, encoding="unicode").strip()
                         parts.append((last if moves else -inf, text))
                     root.clear()
-    except UNREADABLE as error:
+    except (*UNREADABLE, RecursionError) as error:
         raise ValueError(f"{path} must be XML: {error!s:.200}") from error
     _without_files(head, found)
     if found.reads:
@@ -451,8 +451,7 @@ def _without_files(element: ElementTree.Element, found: Copied) -> bool:
     """Take what names files out of an element; return whether anything is left of it."""
     element.tag = tag = element.tag.rpartition("}")[2]
     if tag == "param":
-        key = element.get("key", "")
-        value = element.get("value", "")
+        key, value = element.get("key", ""), element.get("value", "")
         if key.startswith("device.fcd-replay.file"):
             found.read(key, value)
         if _FILE.search(key) or _MEASURES.match(key) or _ELSEWHERE.match(value):

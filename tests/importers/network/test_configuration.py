@@ -71,6 +71,7 @@ def test_a_configuration_gives_files_and_options_of_the_traffic(tmp_path):
         ('additional <a><calibrator file="c"/></a>', ": <calibrator> must not read another file"),
         (f'routes <a {XI}><x:include href="/etc/b"/></a>', ": <include> must not read another"),
         ("additional <a><b/>", " must be XML"),
+        ("additional " + 9000 * "<a>" + 9000 * "</a>", " must be XML: maximum recursion depth"),
     ],
 )
 def test_files_of_no_use_are_refused(tmp_path, change, message):
