@@ -214,8 +214,8 @@ def stretches(points: pl.DataFrame, longest_gap: float) -> pl.DataFrame:
     """
     c = pl.col
     kept = points.unique(["id", "time", "position", "lane_number"], keep="first")
-    wait = c("time").diff()
-    follows = (c("id").diff() == 0) & (wait >= 0.0) & (wait <= longest_gap)
+    wait, move = c("time").diff(), c("position").diff()
+    follows = (c("id").diff() == 0) & (wait >= 0.0) & (wait <= longest_gap) & ~_backwards(move)
     found = (
         kept.sort("id", "row", "time")
         .group_by(stretch=follows.fill_null(False).not_().cum_sum())

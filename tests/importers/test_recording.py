@@ -100,16 +100,18 @@ def halves(points):
 
 
 @pytest.mark.parametrize(
-    ("back", "again", "keep"),
+    ("back", "again", "keep", "ids"),
     [
-        (0.4, 0, 1),  # a correction of four frames
-        (30.0, 0, 1),
-        (60.0, 100, 1),  # another recording, whose clock begins anew
-        (30.0, 0, 4),  # rarely two vehicles on the road
+        (0.4, 0, 1, 100),  # a correction of four frames
+        (30.0, 0, 1, 100),
+        (60.0, 100, 1, 100),  # another recording, whose clock begins anew
+        (30.0, 0, 4, 100),  # rarely two vehicles on the road
+        (18.0, 0, 1, 10),  # ids are used again, 20 s later
     ],
 )
-def test_a_time_that_steps_back_into_traffic_is_refused(back, again, keep, tmp_path):
+def test_a_time_that_steps_back_into_traffic_is_refused(back, again, keep, ids, tmp_path):
     points = by_time(stream())
+    points[:, 0] %= ids
     points = points[points[:, 0] % keep == 0]
     late = points[:, 1] > 59.95
     row, at = 2 + late.argmax(), points[late.argmax(), 1] - back

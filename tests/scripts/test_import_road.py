@@ -64,6 +64,22 @@ def test_trajectories_become_a_road_that_the_other_commands_take(road, tmp_path)
     assert new.is_file()
 
 
+def test_files_that_overlap_in_time_and_rows_that_are_left_out_are_told(road, tmp_path):
+    points = stream(seconds=65.0) + np.array([0, 1.7e9, 0, 0])
+    files = [
+        plain(tmp_path / "a.csv", np.concatenate([points, points[:5]])),
+        plain(tmp_path / "b.csv", points + np.array([0, 40, 0, 0])),
+    ]
+    words = (
+        "trajectories", "--env", on(road), "--output", tmp_path / "new", "--format", "table",
+        "--columns", "time=t", "vehicle=id", "x=s", "speed=v", "--files",
+    )  # fmt: skip
+    printed = run(*words, *files)
+    assert "a.csv: 5 dropped: duplicates of another row\n" in printed
+    assert "note: a.csv and b.csv overlap in time, from 1700000040 s on: " in printed
+    assert refused("import", *words, *files, files[0]).startswith("error: files must be given once")
+
+
 def test_a_mapping_describes_the_data(road, tmp_path):
     (tmp_path / "data.toml").write_text(
         'format = "ngsim"\n[where]\nLocation = "us-101"\n[layout.mainline]\nlanes = [1, 2, 3]\n'
