@@ -125,9 +125,9 @@ class FieldSource:
             OSError: A file cannot be read.
 
         Warns:
-            UserWarning: Gaps were filled; vehicles are conserved only if rows are intervals or
-                cells in the other order; data are odd in the unit that is given, or all speeds are
-                low, which congestion may explain, or another unit.
+            UserWarning: Gaps were filled; the road is empty at times; vehicles are conserved only
+                if rows are intervals or cells in the other order; data are odd in the unit that is
+                given, or all speeds are low, which congestion may explain, or another unit.
         """
         number(float, self.cell, "cell", Interval(0.001, 10))
         number(float, self.interval, "interval", Interval(0.01, 3600))
@@ -141,19 +141,22 @@ class FieldSource:
         allowed = f"a table of {self.density}'s shape {density.shape}"
         require(other.shape == density.shape, str(path), allowed, other.shape)
         off = self._off(density, other, density * other if kind == "speed" else other)
+        empty = ((density == 0.0) & ~np.isnan(other) & ~off).all(axis=0)
         other = np.where(np.isnan(other) & (density == 0.0), 0.0, other)
         density[off] = other[off] = np.nan
         density, other = (
             self._filled(*each, off) for each in (("density", density), (kind, other))
         )
-        if off.any():
-            name = "row" if self.transposed else "column"
-            where = ranges(np.flatnonzero(off.any(axis=0)) + 1)
-            warnings.warn(
-                f"{self.density}: detectors were off in {name}(s) {where}, as zeros in both files "
-                f"tell: {off.sum()} of {off.size} cells are interpolated in time",
-                stacklevel=3,
-            )
+        for columns, told in (
+            (off.any(axis=0), f"detectors were off: {off.sum()} zeros in both files are gaps"),
+            (empty, "the road is empty, as all densities are 0"),
+        ):
+            if columns.any():
+                name = "row" if self.transposed else "column"
+                warnings.warn(
+                    f"{self.density}: in {name}(s) {ranges(np.flatnonzero(columns) + 1)}, {told}",
+                    stacklevel=3,
+                )
         lasts = density.shape[1] * self.interval
         allowed = f"a field of at most {LONGEST_FIELD} s, at {self.interval:g} s a column"
         require(lasts <= LONGEST_FIELD, str(self.density), allowed, f"{lasts:g} s")
