@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import glob
 import shutil
 import uuid
 import warnings
@@ -256,7 +257,8 @@ def assign_seeds(splits: Sequence[Split], n_windows: int) -> dict[str, tuple[int
 def new_folder(output: Path) -> Iterator[Path]:
     """Yield an empty folder that becomes `output` when the body ends, and vanishes if it fails.
 
-    Its parent is a folder for this alone, in which the body may leave what is thrown away.
+    Its parent is a folder for this alone, in which the body may leave what is thrown away. That of
+    a process that was killed goes, too.
 
     Raises:
         ValueError: There is something at `output`, or it cannot be written.
@@ -265,6 +267,8 @@ def new_folder(output: Path) -> Iterator[Path]:
     require_output(output.parent, [output.name])
     output.parent.mkdir(parents=True, exist_ok=True)
     work = output.parent / f".{output.name}-{uuid.uuid4().hex}"
+    for left in output.parent.glob(f".{glob.escape(output.name)}-{'[0-9a-f]' * 32}"):
+        shutil.rmtree(left, ignore_errors=True)
     folder = work / "result"
     folder.mkdir(parents=True)
     try:

@@ -63,6 +63,13 @@ def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+    # A process that is killed leaves a folder, which the same command removes.
+    for name in (".imported-", ".imported-else-"):
+        (tmp_path / (name + 32 * "f") / "result").mkdir(parents=True)
+    with pytest.raises(KeyboardInterrupt):
+        run(path)
+    left = {each.name for each in tmp_path.iterdir()}
+    assert left == {"a.csv", ".imported-else-" + 32 * "f"}
 
 
 def test_a_mainline_that_nobody_drives_on_is_told(tmp_path):

@@ -1,17 +1,22 @@
 """Evaluation by the command: the same numbers in tables, Markdown, JSON and rows."""
 
 import dataclasses
+import errno
 import json
+import signal
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import polars as pl
 import pytest
 from PIL import Image
 
+from agents import study
 from agents.study import read_rows, write_table
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import load_policy
+from scripts import evaluate as evaluate_script
 from scripts.evaluate import Args, main, make_cells
 from tests.helpers import SHORT, save_untrained
 from tests.scripts.commands import refused, run_command
@@ -81,6 +86,51 @@ def test_one_episode_has_no_interval(tmp_path):
     assert "one episode has no interval" in tables.lower()
     assert "±" not in tables
     assert "1 episode on test traffic" in tables
+
+
+def test_it_goes_on_wherever_it_was_ended(tmp_path, monkeypatch):
+    out, played, play_cell = tmp_path / "out", [], study._play_cell
+    env = f'{SHORT} {{"estimator": "random_walk", "horizon": 64}}'
+    words = ["evaluate", "--env", env, "--seeds", "2000:2002", "--schedules", "none", "paper"]
+    words += ["--workers", "1", "--output", out]
+
+    def play_two(*given):
+        played.append(given)
+        if len(played) == 3:
+            signal.raise_signal(signal.SIGTERM)
+        return play_cell(*given)
+
+    def full(path, content):
+        if path.name.startswith(".rows"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write_bytes(path, content)
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    write_bytes, handler = Path.write_bytes, signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(study, "_play_cell", play_two)
+    done = run_command(*words)
+    assert (done.returncode, len(played)) == (143, 3)
+    assert "the same command goes on from what is done" in done.stderr
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        done = run_command(*words)
+    assert (done.returncode, len(played)) == (1, 4)
+    assert done.stderr.splitlines()[-1] == f"error: {out / 'rows.parquet'}: No space left on device"
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluate_script, "draw_traffic", interrupt)
+        assert run_command(*words).returncode == 130
+    assert not (out / "tables.md").exists()
+    assert run_command(*words).returncode == 0
+    assert len(played) == 4
+    names = {"rows.parquet", "schedules.png", "space_time.png", "tables.md"}
+    assert {path.name for path in out.iterdir()} == names
+    assert signal.getsignal(signal.SIGTERM) == handler
+    with monkeypatch.context() as patch:  # what is begun anew, the old results do not describe
+        patch.setattr(evaluate_script, "draw_traffic", interrupt)
+        assert "begins anew" in run_command(*words, "--force").stderr
+    assert {path.name for path in out.iterdir()} == {"rows.parquet", "schedules.png"}
 
 
 def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):

@@ -101,10 +101,9 @@ def test_a_place_where_results_cannot_go_is_refused_before_any_work(name, tmp_pa
         taken = tmp_path / ("taken" if not is_one else f"taken{kept}")
         mine = taken if is_one else taken / kept
         mine.mkdir(parents=True)
-        words = [*words, "--force"] if "force" in run_command(*name.split(), "-h").stdout else words
-        assert str(mine) in refused(*given(taken))  # no force removes a folder
+        force = ["--force"] if "--force" in run_command(*name.split(), "-h").stdout else []
+        assert str(mine) in refused(*given(taken), *force)  # which removes no folder
         mine.rmdir()
-        words = COMMANDS[name][0]
         mine.write_text("mine")
         assert str(mine) in refused(*given(taken))
         assert mine.read_text() == "mine"

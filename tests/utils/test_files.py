@@ -127,8 +127,9 @@ def test_a_file_is_replaced_when_the_new_one_is_complete_or_not_at_all(tmp_path,
         interrupted()
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        with pytest.raises(OSError, match="No space left"):
+        with pytest.raises(OSError, match="No space left") as raised:
             write_atomically(path, "new")
+        assert raised.value.filename == str(path)
     assert path.read_bytes() == b"old \xce\xb5\n"
     writers = [Thread(target=write_atomically, args=(path, b"\x00\xff")) for _ in range(8)]
     for writer in writers:

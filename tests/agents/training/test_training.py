@@ -128,6 +128,7 @@ def test_a_finished_training_is_left_alone(name, whole, tmp_path):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     left = {PLAN, PROGRESS, CHECKPOINT, RULES_FILE, CURVE, *POLICIES}
     assert set(before) - {"tensorboard"} == left
+    (folder / PROGRESS).unlink()  # as if it was killed right after its last checkpoint
     train(make_plan(name), folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
