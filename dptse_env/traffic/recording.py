@@ -170,7 +170,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def follow_parent(parent: int, folder: str | None = None) -> None:
-    """Leave interrupts to the parent of this process, and end when it ends.
+    """Leave Ctrl-C and SIGTERM to the parent of this process, and end when it ends.
 
     Args:
         parent: The process id of the parent.
@@ -183,7 +183,8 @@ def follow_parent(parent: int, folder: str | None = None) -> None:
             shutil.rmtree(folder, ignore_errors=True)
         os._exit(1)
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM):  # a whole group of processes may have them
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 

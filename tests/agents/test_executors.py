@@ -76,7 +76,7 @@ def meet(folder):
 
 
 def interrupted(number):
-    os.kill(os.getpid(), signal.SIGINT)
+    os.kill(os.getpid(), signal.SIGTERM if number else signal.SIGINT)
     return number
 
 

@@ -1,6 +1,5 @@
 """Evaluation by the command: the same numbers in tables, Markdown, JSON and rows."""
 
-import dataclasses
 import errno
 import json
 import signal
@@ -13,11 +12,11 @@ import pytest
 from PIL import Image
 
 from agents import study
-from agents.study import read_rows, write_table
+from agents.study import read_rows
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import load_policy
 from scripts import evaluate as evaluate_script
-from scripts.evaluate import Args, main, make_cells
+from scripts.evaluate import Args, make_cells
 from tests.helpers import SHORT, save_untrained
 from tests.scripts.commands import refused, run_command
 
@@ -131,6 +130,7 @@ def test_it_goes_on_wherever_it_was_ended(tmp_path, monkeypatch):
         patch.setattr(evaluate_script, "draw_traffic", interrupt)
         assert "begins anew" in run_command(*words, "--force").stderr
     assert {path.name for path in out.iterdir()} == {"rows.parquet", "schedules.png"}
+    assert len(played) == 7
 
 
 def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):
@@ -145,22 +145,6 @@ def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):
     assert done.returncode == 0, done.stderr
     assert sum("on another road" in each.message for each in caplog.records) == 1
     assert "Warning" not in done.stderr
-
-
-@pytest.mark.slow
-def test_an_interrupted_run_goes_on_and_a_forced_one_begins_anew(tmp_path):
-    args = Args(env=WALK, schedules=("random",), seeds="2000:2002", output=tmp_path, workers=1)
-    main(args)
-    first = rows_of(tmp_path).drop("version")
-    marked = rows_of(tmp_path).with_columns(rmse_density=pl.lit(1.0))
-    (tmp_path / "rows").mkdir()
-    write_table(tmp_path / "rows" / "cell.parquet", marked.filter(pl.col("policy") == "random"))
-    for name in ("rows.parquet", "tables.md", "schedules.png", "space_time.png"):
-        (tmp_path / name).unlink()
-    main(args)
-    assert rows_of(tmp_path, "random")["rmse_density"].to_list() == [1.0, 1.0]
-    main(dataclasses.replace(args, force=True))
-    assert rows_of(tmp_path).drop("version").sort(first.columns).equals(first.sort(first.columns))
 
 
 def test_policies_and_schedules_play_what_gym_make_makes(tmp_path):
