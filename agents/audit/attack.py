@@ -23,29 +23,6 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 BATCH = 250
 """Default number of runs per world that are played at once."""
 
-DECISION_THRESHOLD = 3.0
-"""Log-likelihood ratio at which an adaptive policy is decided: odds of 20 to 1."""
-
-
-@dataclass(frozen=True)
-class Queries:
-    """The adversary's query policy.
-
-    Attributes:
-        plan: Options to query by step, shape (horizon, G), or (horizon, k, G) where each of k runs
-            has its own.
-        is_adaptive: Whether it stops where it is decided between the worlds.
-    """
-
-    plan: BoolArray
-    is_adaptive: bool = False
-
-    def at(self, step: int, score: FloatArray) -> BoolArray:
-        """Return the options to query, shape (k, G), given the scores so far, (k,)."""
-        undecided = (np.abs(score) < DECISION_THRESHOLD) | (not self.is_adaptive)
-        queries: BoolArray = self.plan[step] & undecided[:, None]
-        return queries
-
 
 @dataclass(frozen=True)
 class Runs:
@@ -189,7 +166,7 @@ def make_overheard(
 def attack(
     config: EnvConfig,
     worlds: Worlds,
-    queries: Queries,
+    plan: BoolArray,
     n_runs: int,
     *,
     noise_factor: float = 1.0,
@@ -205,7 +182,7 @@ def attack(
     Args:
         config: The configuration under attack.
         worlds: The two worlds.
-        queries: The query policy.
+        plan: Options to query by step, shape (horizon, G).
         n_runs: Runs per world n.
         noise_factor: Multiplies the noise that the configuration declares.
         seed: Seeds the noise, >= 0.
@@ -218,7 +195,7 @@ def attack(
     """
     played = run_in_order(
         executor,
-        partial(play, config, worlds, queries, noise_factor, seed),
+        partial(play, config, worlds, plan, noise_factor, seed),
         [range(n_runs)[first : first + batch] for first in range(0, n_runs, batch)],
         size=lambda runs: 2 * len(runs),
         progress=progress,
@@ -234,7 +211,7 @@ def attack(
 def play(
     config: EnvConfig,
     worlds: Worlds,
-    queries: Queries,
+    plan: BoolArray,
     noise_factor: float,
     seed: int,
     runs: range,
@@ -243,7 +220,7 @@ def play(
     # A run's noise stream does not depend on the batch.
     streams = [np.random.default_rng((seed, world, run)) for world in (0, 1) for run in runs]
     seeds = np.repeat([0, 1], len(runs))
-    *_, release = overheard(config, worlds, seeds, queries, streams, noise_factor)
+    *_, release = overheard(config, worlds, seeds, plan, streams, noise_factor)
     return Runs(release.score.reshape(2, -1), np.sqrt(release.square).reshape(2, -1))
 
 
@@ -251,7 +228,7 @@ def overheard(
     config: EnvConfig,
     worlds: Worlds,
     seeds: IntArray,
-    queries: Queries,
+    plan: BoolArray,
     streams: Sequence[np.random.Generator],
     factor: float = 1.0,
 ) -> Iterator[Overheard]:
@@ -261,7 +238,8 @@ def overheard(
         config: The configuration under attack.
         worlds: The worlds.
         seeds: Those that are played, shape (k,).
-        queries: The query policy.
+        plan: Options to query by step, shape (horizon, G), or (horizon, k, G) where each episode
+            has its own.
         streams: Generators that seed the k episodes.
         factor: Multiplies the noise that the configuration declares.
 
@@ -271,8 +249,8 @@ def overheard(
     process, release = make_overheard(config, worlds, len(seeds), factor)
     every = np.arange(len(seeds))
     process.reset(every, streams, {"traffic_seed": seeds, "start": 0})
-    for step in range(config.horizon_steps):
-        process.step(every, queries.at(step, release.score).astype(np.int8))
+    for queried in plan.reshape(len(plan), -1, plan.shape[-1]).astype(np.int8):
+        process.step(every, np.broadcast_to(queried, (every.size, queried.shape[-1])))
         yield release
 
 

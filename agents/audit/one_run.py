@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from agents.audit.attack import Queries, overheard
+from agents.audit.attack import overheard
 from agents.audit.planner import Planner
 from agents.audit.statistics import error_bound
 from agents.audit.worlds import Trajectory, Worlds
@@ -218,7 +218,7 @@ def _play(
     plan = np.stack([design.plan for design in designs], axis=1)
     streams = generator.spawn(len(designs))
     played = overheard(
-        config, Worlds(record, added, pairs), worlds[:, 2], Queries(plan), streams, noise_factor
+        config, Worlds(record, added, pairs), worlds[:, 2], plan, streams, noise_factor
     )
     heard = np.array([release.heard for release in played])
     return [

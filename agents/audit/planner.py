@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from agents.audit.attack import Queries, attack, overheard
+from agents.audit.attack import attack, overheard
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface, make_release
@@ -23,7 +23,7 @@ KINDS = ("worst-case", "opposite", "replaced", "deleted")
 PUBLIC_SCHEDULES = ("paper", "static", "round-robin")
 """Schedules that ignore observations: their queries are known beforehand."""
 
-POLICIES = ("hunter", "adaptive", *PUBLIC_SCHEDULES)
+POLICIES = ("hunter", *PUBLIC_SCHEDULES)
 """Names of the query policies."""
 
 SHORTLIST = 12
@@ -245,16 +245,10 @@ class Planner:
 
     def _reached(self, worlds: AdjacentWorlds) -> float:
         """Return the mean distance that the policy reaches between two worlds in some runs."""
-        queries = Queries(self.plan(worlds))
-        return float(
-            attack(self.config, worlds, queries, REHEARSALS, progress=False).distances.mean()
-        )
+        runs = attack(self.config, worlds, self.plan(worlds), REHEARSALS, progress=False)
+        return float(runs.distances.mean())
 
     # Queries ------------------------------------------------------------------------------------
-
-    def queries(self, worlds: AdjacentWorlds) -> Queries:
-        """Return the policy for two worlds."""
-        return Queries(self.plan(worlds), is_adaptive=self.policy == "adaptive")
 
     def plan(self, worlds: AdjacentWorlds) -> BoolArray:
         """Return the policy's queries, shape (horizon, G).
@@ -398,9 +392,7 @@ def public_terms(
         speeds [km/h], shape (T, places), NaN where mean speeds are released.
     """
     alike = AdjacentWorlds(record, (Trajectory.absent(), Trajectory.absent()))
-    played = overheard(
-        config, alike, np.zeros(1, int), Queries(plan), [np.random.default_rng(seed)]
-    )
+    played = overheard(config, alike, np.zeros(1, int), plan, [np.random.default_rng(seed)])
     rows = []
     for release in played:
         rows.append((release.last.sigma[0].copy(), release.last.centre[0].copy()))

@@ -188,15 +188,15 @@ def audit_environment(
     noise = examine(residuals_of(config, record, noise_factor=noise_factor, seed=seed))
     if target == CLIMBED:
         options: dict[str, Any] = {"policy": policy, "seed": seed, "executor": executor}
-        worlds, queries = climb(config, record, rounds, **options)
+        worlds, plan = climb(config, record, rounds, **options)
     else:
         planner = Planner(config, policy)
         worlds = planner.choose(record, target)
-        queries = planner.queries(worlds)
+        plan = planner.plan(worlds)
     runs = attack(
         config,
         worlds,
-        queries,
+        plan,
         n_runs,
         noise_factor=noise_factor,
         seed=seed,

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from agents.audit.attack import Queries, overheard
+from agents.audit.attack import overheard
 from agents.audit.planner import PUBLIC_SCHEDULES, Planner, public_plan, random_plan
 from agents.audit.worlds import AdjacentWorlds, Trajectory, Worlds
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
@@ -153,7 +153,7 @@ def climb(
     policy: str = "hunter",
     seed: int = 0,
     executor: AnyExecutor = THIS_PROCESS,
-) -> tuple[AdjacentWorlds, Queries]:
+) -> tuple[AdjacentWorlds, BoolArray]:
     """Return the worlds and queries of the largest distance that a search reaches.
 
     Args:
@@ -180,7 +180,7 @@ def climb(
     _, pair = max(herds, key=lambda herd: herd[0])
     description = f"an added vehicle that climbed in {rounds} rounds from a random trip"
     worlds = AdjacentWorlds(record, pair.trips, description)
-    return worlds, Queries(pair.plan, is_adaptive=policy == "adaptive")
+    return worlds, pair.plan
 
 
 def _climb(
@@ -208,5 +208,5 @@ def squared_distances(
     worlds = Worlds(record, trips, np.repeat(seeds, 2, axis=0))
     plan = np.stack([pair.plan for pair in pairs], axis=1)
     streams = [np.random.default_rng((seed, k)) for k in range(len(pairs))]
-    *_, release = overheard(config, worlds, seeds[:, 0], Queries(plan), streams)
+    *_, release = overheard(config, worlds, seeds[:, 0], plan, streams)
     return release.square

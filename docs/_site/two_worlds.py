@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.audit.attack import Queries, overheard
+from agents.audit.attack import overheard
 from agents.audit.planner import public_plan
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from agents.environments import make_config
@@ -52,9 +52,9 @@ def play(config: EnvConfig, worlds: AdjacentWorlds) -> Transcript:
         {t: (s, v) for t, s, v in zip(trip.step, trip.segment, trip.speed, strict=True)}
         for trip in worlds.trajectories
     ]
-    queries, paid = Queries(public_plan(config, "round-robin")), np.zeros(2)
+    plan, paid = public_plan(config, "round-robin"), np.zeros(2)
     world_0, streams = np.zeros(1, dtype=np.int64), [np.random.default_rng(0)]
-    for t, release in enumerate(overheard(config, worlds, world_0, queries, streams)):
+    for t, release in enumerate(overheard(config, worlds, world_0, plan, streams)):
         observed, values, sigma, centre = (part[0] for part in release.last)
         length = release.task.length
         for world, trip in enumerate(trips):

@@ -115,9 +115,9 @@ def test_the_worst_pair_is_searched_for_and_attacked(tmp_path):
 
 def test_every_argument_arrives(tmp_path):
     privacy = {**CAPPED, "delta": 0.01, "adjacency": "add_remove"}
-    arguments = {"runs": 10, "target": "deleted", "policy": "adaptive", "confidence": 0.9}
+    arguments = {"runs": 10, "target": "deleted", "policy": "static", "confidence": 0.9}
     name, found = run(tmp_path / "first", privacy, seed=5, traffic_seed=1, **arguments)
-    assert name == "capped-deleted-adaptive.json"
+    assert name == "capped-deleted-static.json"
     assert found["result"]["claim"]["delta"] == 0.01
     assert found["result"]["confidence"] == 0.9
     assert found["result"]["n"] == 10

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from agents.audit.attack import Queries, attack
+from agents.audit.attack import attack
 from agents.audit.planner import Planner
 from agents.audit.worlds import Trajectory
 from dptse_env.config import EnvConfig
@@ -51,9 +51,8 @@ def staying(segment, speed=0.0):
 
 def runs_of(setting, worlds, n_runs=2, policy="hunter", **options):
     """Attack with the plan of a policy, or one that is given."""
-    is_name = isinstance(policy, str)
-    queries = Planner(setting, policy).queries(worlds) if is_name else Queries(policy)
-    return attack(setting, worlds, queries, n_runs, progress=False, **options)
+    plan = Planner(setting, policy).plan(worlds) if isinstance(policy, str) else policy
+    return attack(setting, worlds, plan, n_runs, progress=False, **options)
 
 
 def reached(setting, worlds, policy="hunter", n_runs=2):

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from agents.audit.attack import DECISION_THRESHOLD, Queries, attacked_form, make_overheard
+from agents.audit.attack import attacked_form, make_overheard
 from agents.audit.planner import Planner, public_plan
 from agents.audit.statistics import Claim, audit
 from agents.audit.worlds import AdjacentWorlds, Trajectory
@@ -143,27 +143,13 @@ def test_scores_have_the_law_of_their_distance(setting, factor, record):
 def test_runs_depend_on_their_seed_alone(setting, record):
     """Not on how many are played at once, nor where."""
     worlds = Planner(setting).choose(record, "replaced")
-    together = runs_of(setting, worlds, 5, "adaptive", seed=3)
+    together = runs_of(setting, worlds, 5, seed=3)
     for options in ({"batch": 2}, {"batch": 3, "executor": Elsewhere()}):
-        parts = runs_of(setting, worlds, 5, "adaptive", seed=3, **options)
+        parts = runs_of(setting, worlds, 5, seed=3, **options)
         np.testing.assert_array_equal(together.scores, parts.scores)
         np.testing.assert_array_equal(together.distances, parts.distances)
-    other = runs_of(setting, worlds, 5, "adaptive", seed=4)
+    other = runs_of(setting, worlds, 5, seed=4)
     assert not np.isin(other.scores, together.scores).any()
-
-
-def test_the_adaptive_hunter_rests_where_it_is_decided(record):
-    plan, mark = np.ones((2, 3), dtype=bool), DECISION_THRESHOLD
-    score = np.array([0.0, -mark - 0.1, mark + 0.1, 0.5 * mark])
-    queries = Queries(plan, is_adaptive=True).at(0, score)
-    assert queries.any(axis=1).tolist() == [True, False, False, True]
-    assert Queries(plan).at(0, score).all()
-    for setting in (config(epsilon=10.0), paced(epsilon=10.0)):
-        worlds = Planner(setting).choose(record, "worst-case")
-        runs = runs_of(setting, worlds, 100, "adaptive")
-        mu = privacy_report(setting).mu
-        assert runs.distances.max() <= mu * (1.0 + 1e-9)
-        assert runs.distances.min() < 0.9 * mu
 
 
 def test_only_prices_and_centres_need_the_estimator_of_the_environment():

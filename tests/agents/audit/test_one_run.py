@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.audit.attack import Queries, overheard
+from agents.audit.attack import overheard
 from agents.audit.one_run import attack_in_one_run, make_design
 from agents.audit.worlds import Worlds
 from dptse_env.parts import make_task, privacy_report
@@ -36,7 +36,7 @@ def test_a_number_tells_of_its_canary_alone(kind, setting, record):
     pairs = [[k, 4 + k] for k in range(4)]
     worlds = Worlds(record, [zeros] * 4 + others, pairs * 2)
     streams = [np.random.default_rng(0) for _ in others]
-    played = overheard(setting, worlds, np.arange(4), Queries(design.plan), streams)
+    played = overheard(setting, worlds, np.arange(4), design.plan, streams)
     heard = np.array([release.heard[0] for release in played])
     together = design.by_canary(heard[:, 0])
     assert np.count_nonzero(together) > 0.7 * design.n

@@ -32,8 +32,8 @@ def one_herd(monkeypatch):
 
 def climbed(setting, record, rounds):
     """The largest distance of a search, over mu."""
-    worlds, queries = climb(setting, record, rounds)
-    runs = attack(setting, worlds, queries, 2, progress=False)
+    worlds, plan = climb(setting, record, rounds)
+    runs = attack(setting, worlds, plan, 2, progress=False)
     return float(runs.distances.max()) / privacy_report(setting).mu
 
 
@@ -81,8 +81,8 @@ def test_a_search_depends_on_its_seed_alone(record, monkeypatch):
     monkeypatch.setattr(search, "CLIMBERS", 3)
     setting, found = paced("ekf"), []
     for options in ({}, {"executor": Elsewhere()}, {"seed": 1}):
-        worlds, queries = climb(setting, record, 2, **options)
-        found.append((worlds.trajectories[0].speed, queries.plan))
+        worlds, plan = climb(setting, record, 2, **options)
+        found.append((worlds.trajectories[0].speed, plan))
     for one, other in zip(found[0], found[1], strict=True):
         np.testing.assert_array_equal(one, other)
     assert not np.array_equal(found[0][1], found[2][1])
