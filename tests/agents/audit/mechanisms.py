@@ -1,22 +1,11 @@
 """Release models with one fault each, which state the guarantee of the model that they change."""
 
+from functools import partial
+
 import numpy as np
 
 from dptse_env.release import Capped, Paced
 from dptse_env.release.noise import Noise
-
-
-class Quiet(Noise):
-    """Half of the noise that is stated."""
-
-    scale = 0.5
-
-    def __init__(self, n_episodes, n_columns):
-        super().__init__(n_episodes, n_columns, scale=self.scale)
-
-
-class Fainter(Quiet):
-    scale = 0.8
 
 
 class Altered(Noise):
@@ -124,8 +113,8 @@ MECHANISMS = {
     f"`{base.__name__.lower()}`, {name}": noisy(base, kind)
     for base in (Capped, Paced)
     for name, kind in {
-        "half the noise": Quiet,
-        "four fifths of the noise": Fainter,
+        "half the noise": partial(Noise, scale=0.5),
+        "four fifths of the noise": partial(Noise, scale=0.8),
         "one noise for two columns": SharedByTwo,
         "one noise for counts and deviations": OneForBoth,
         "32 s of noise again and again": Again,

@@ -13,9 +13,10 @@ from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import ROUNDING, epsilon_of
 from dptse_env.release import Capped, CappedSettings, ReleaseModel
-from dptse_env.release.noise import Noise, grid_of
+from dptse_env.release.noise import grid_of
 from tests.agents.elsewhere import Elsewhere
 
+from .mechanisms import MECHANISMS
 from .small import HORIZON, ROAD, config, paced, runs_of, staying
 
 
@@ -189,14 +190,6 @@ def test_a_cap_that_is_not_held_is_rejected(record, monkeypatch):
     assert verdict(setting, worlds, policy="static") == "rejected"
 
 
-class OwnNoise(Capped):
-    """A mechanism of one's own, whose noise falls short of what it states."""
-
-    def __init__(self, task, traffic):
-        super().__init__(task, traffic)
-        self.noise = Noise(task.n_episodes, task.n_columns, scale=0.5)
-
-
 class AskedTooOften(Capped):
     """A vehicle counts once more whenever the estimator predicts a free road."""
 
@@ -206,7 +199,7 @@ class AskedTooOften(Capped):
         return super().release(request)
 
 
-@pytest.mark.parametrize("mechanism", [OwnNoise, AskedTooOften])
+@pytest.mark.parametrize("mechanism", [MECHANISMS["`capped`, half the noise"], AskedTooOften])
 def test_a_mechanism_of_ones_own_is_caught(mechanism, record):
     setting = config(preset=mechanism, epsilon=5.0, cap=2)
     worlds = AdjacentWorlds(record, (staying(1), staying(3)))
