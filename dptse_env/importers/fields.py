@@ -234,7 +234,7 @@ class FieldSource:
     def _off(self, density: FloatArray, other: FloatArray, flow: FloatArray) -> BoolArray:
         """Return where detectors were off, shape (cells, intervals): zeros that cannot be."""
         zero = (density == 0.0) & (other == 0.0)
-        off = zero & (zero.all(axis=0) | zero.all(axis=1, keepdims=True))
+        off: BoolArray = zero & (zero.all(axis=0) | zero.all(axis=1, keepdims=True))
         for cell in np.flatnonzero((zero & ~off).any(axis=1)):
             sides = [side for side in (flow[:cell], flow[cell + 1 :]) if len(side)]
             passing = np.min([np.nan_to_num(side).mean(axis=0) for side in sides], axis=0)
