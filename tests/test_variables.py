@@ -26,7 +26,9 @@ NO_EFFECT = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("variables", [NO_EFFECT, {"FORCE_COLOR": "1", "COLUMNS": "20"}])
+@pytest.mark.parametrize(
+    "variables", [NO_EFFECT, {"FORCE_COLOR": "1", "COLUMNS": "20", "TERM": "xterm"}]
+)
 def test_variables_change_colours_and_the_place_of_records_but_no_number(
     variables, tmp_path, capsys
 ):
