@@ -70,6 +70,9 @@ def test_an_imported_model_acts_as_it_did(tmp_path, action, kind, policy, keywor
 def test_nothing_is_unpickled_without_the_users_word(tmp_path):
     (tmp_path / "model.zip").write_bytes(pickle.dumps(Bomb()))
     assert "trust must be given, since" in refused(*words(tmp_path))
+    given = words(tmp_path, "--trust")  # everything else is looked at first
+    assert "bandwidth must be" in refused(*given, "--keywords", '{"bandwidth": 9}')
+    assert "must be a .safetensors file" in refused(*given, "--output", tmp_path / "mine.zip")
     assert not (tmp_path / "mine.safetensors").exists()
 
 
