@@ -20,7 +20,7 @@ import gymnasium as gym
 from gymnasium import spaces
 from tyro.conf import Positional
 
-from agents.environments import make_config
+from agents.environments import make_config, parse_env
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface
 from dptse_env.policies import DETERMINISTIC, SUFFIX
@@ -47,7 +47,7 @@ class Args:
     output: Path
     """File to write, .safetensors."""
     env: str
-    """Id of the environment that it was trained in."""
+    """Environment that it was trained in: an id, or an id and keywords as JSON."""
     keywords: str = "{}"
     """Keywords of that environment, JSON; action, if not given, by the model's action space."""
     vecnormalize: Path | None = None
@@ -69,13 +69,15 @@ def main(args: Args) -> None:
     require(args.output.suffix == SUFFIX, "output", f"a {SUFFIX} file", str(args.output))
     keywords = parse_json(args.keywords, "keywords")
     require(isinstance(keywords, dict), "keywords", "a JSON object", args.keywords)
-    make_config(args.env, keywords)
+    env, own = parse_env(args.env)
+    keywords |= own
+    make_config(env, keywords)
     require_output(args.output.parent, [args.output.name], force=args.force)
     policy, about = _unpickled(args.model, _read_model)
     kind = type(policy.action_space)
     require(kind in ENCODINGS, "model", "one whose action space an encoding has", kind.__name__)
     keywords = {"action": ENCODINGS[kind], **keywords}
-    config = make_config(args.env, keywords)
+    config = make_config(env, keywords)
     _check_spaces(policy, config)
     scaled = None if args.vecnormalize is None else _unpickled(args.vecnormalize, _read_statistics)
     from dptse_env.sb3 import save_policy  # noqa: PLC0415
@@ -84,7 +86,7 @@ def main(args: Args) -> None:
         args.output,
         policy,
         config,
-        env=args.env,
+        env=env,
         keywords={key: value for key, value in keywords.items() if key != "action"},
         training=about,
         figures={},

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import glob
+import os
 import shutil
 import uuid
 import warnings
@@ -29,6 +31,8 @@ from dptse_env.utils.fields import require, require_name
 from dptse_env.utils.files import require_output
 
 ROAD = "road.toml"
+NO_SPACE = 2**16
+"""Free space below which a disk is full [bytes]."""
 SMALLEST_SHARE = 0.001
 """Exit shares must be above 0 and below 1: nobody or everybody leaving counts as this much."""
 
@@ -274,5 +278,10 @@ def new_folder(output: Path) -> Iterator[Path]:
     try:
         yield folder
         folder.rename(output)
+    except Exception as problem:
+        # Whatever else is said then, such as that a file of ours which was cut off is malformed.
+        if shutil.disk_usage(work).free < NO_SPACE:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(output)) from problem
+        raise
     finally:
         shutil.rmtree(work, ignore_errors=True)

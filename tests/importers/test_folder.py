@@ -1,6 +1,7 @@
 """The folder of an import: splits, seeds, and all or nothing."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,11 +59,19 @@ def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
+    def cut_off(*_):
+        raise ValueError("0.parquet is malformed")
+
     path = plain(tmp_path / "a.csv", stream())
     monkeypatch.setattr("dptse_env.importers.folder.write_report", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+    with monkeypatch.context() as patch:  # a file that was cut off looks malformed
+        patch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=0))
+        patch.setattr("dptse_env.importers.folder.write_report", cut_off)
+        with pytest.raises(OSError, match=r"No space left .*imported"):
+            run(path)
     # A process that is killed leaves a folder, which the same command removes.
     for name in (".imported-", ".imported-else-"):
         (tmp_path / (name + 32 * "f") / "result").mkdir(parents=True)

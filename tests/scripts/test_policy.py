@@ -72,6 +72,8 @@ def test_nothing_is_unpickled_without_the_users_word(tmp_path):
     assert "trust must be given, since" in refused(*words(tmp_path))
     given = words(tmp_path, "--trust")  # everything else is looked at first
     assert "bandwidth must be" in refused(*given, "--keywords", '{"bandwidth": 9}')
+    assert "env must be the id" in refused(*given, "--env", "nope")
+    assert "bandwidth must be" in refused(*given, "--env", f'{SHORT} {{"bandwidth": 9}}')
     assert "must be a .safetensors file" in refused(*given, "--output", tmp_path / "mine.zip")
     assert not (tmp_path / "mine.safetensors").exists()
 
