@@ -330,5 +330,5 @@ def test_a_field_that_is_too_short_may_be_transposed(tmp_path):
 
 def test_a_folder_is_never_replaced(tmp_path):
     import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
-    with pytest.raises(ValueError, match=r"output must be a folder that does not exist yet"):
+    with pytest.raises(ValueError, match=r"output must not exist yet"):
         import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
