@@ -440,7 +440,7 @@ MUTANTS = (
     ),
     Mutant(
         "a number is settled by the bits of the next second", 16, "release/noise.py",
-        "self._next[row] - 1, c, q", "self._next[row], c, q",
+        "self._next[row] - 1, c, q", "self._next[row] % BLOCK, c, q",
         "release/test_noise.py",
     ),
     Mutant(
