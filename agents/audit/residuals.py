@@ -158,7 +158,7 @@ def _products(known: FloatArray, seen: BoolArray) -> Iterator[tuple[float, str]]
     most = most._replace(n_tests=sum(each.n_tests for each, _ in pairs))
     for found, between in ((most, pair), (together, words)):
         what = f"correlation {found.correlation:.2f} of {between}, {found.lag} s later"
-        yield 2.0 * float(ndtr(-found.z)) * found.n_tests, what
+        yield 2.0 * float(ndtr(-found.z)) * max(found.n_tests, 1), what
 
 
 class _Largest(NamedTuple):

@@ -120,8 +120,9 @@ def test_wrong_noise_is_found_and_named(said):
     assert said in found.suspect
 
 
-def test_more_noise_than_stated_is_none_of_its_faults():
-    assert not examine(3.0 * white(np.random.default_rng(0))).is_rejected
+@pytest.mark.parametrize(("factor", "n"), [(3.0, N), (1.0, 4)])
+def test_neither_more_noise_than_stated_nor_too_little_to_say_is_a_fault(factor, n):
+    assert not examine(factor * white(np.random.default_rng(0), n)).is_rejected
 
 
 def test_probabilities_are_those_of_white_noise():
