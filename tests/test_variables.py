@@ -36,7 +36,8 @@ def test_variables_change_colours_and_the_place_of_records_but_no_number(
     expected = capsys.readouterr().out
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, check=True,
-        env={**os.environ, **variables, "DPTSE_CACHE": str(tmp_path)}, encoding="utf-8",
+        env={**os.environ, **variables, "DPTSE_CACHE": str(tmp_path), "PYTHONUTF8": "1"},
+        encoding="utf-8",
     )  # fmt: skip
     assert len(list(tmp_path.rglob("*.safetensors"))) == 1
     if "FORCE_COLOR" in variables:  # as at a terminal, where narrow tables fold
