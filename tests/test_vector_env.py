@@ -86,11 +86,8 @@ def test_threads_change_nothing(estimator):
 def test_compiled_estimators_work_on_so_many_threads(estimator, threads, n, monkeypatch):
     env = make_batch(2 * SMALLEST_BLOCK, estimator=estimator, threads=threads)
     env.reset(seed=0)
-    names, predict, together = (
-        set(),
-        env.process.estimator.predict,
-        threading.Barrier(n, timeout=300.0),
-    )
+    names, predict = set(), env.process.estimator.predict
+    together = threading.Barrier(n, timeout=300.0)
 
     def watched(episodes, inputs):
         together.wait()

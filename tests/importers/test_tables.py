@@ -8,15 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from dptse_env.importers import (
-    Layout,
-    Part,
-    Source,
-    Split,
-    TrajectoryError,
-    import_trajectories,
-    tables,
-)
+from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError, import_trajectories
 from dptse_env.importers.tables import NGSIM_COLUMNS
 from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordLibrary, simulate, sumo
 from dptse_env.traffic.sumo_input import edge_ids
@@ -180,8 +172,8 @@ def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expect
 def test_a_document_that_is_too_long_is_not_read_to_its_end(tmp_path, monkeypatch):
     path = tmp_path / "i24.json"
     path.write_text(json.dumps(i24(stream())))
-    monkeypatch.setattr(tables, "BLOCK", 8)
-    monkeypatch.setattr(tables, "LONGEST_DOCUMENT", 16)
+    monkeypatch.setattr("dptse_env.importers.tables.BLOCK", 8)
+    monkeypatch.setattr("dptse_env.importers.tables.LONGEST_DOCUMENT", 16)
     with pytest.raises(TrajectoryError, match="row 1: it is no complete JSON array"):
         run(path, Source("i24", layout=Layout(origin=310000.0)))
 
