@@ -6,14 +6,13 @@ The links of the site are checked where it is built, by ``docs/_site/links.py``.
 import re
 import runpy
 import tomllib
-from pathlib import Path
 
 import pytest
 
 import dptse_env
 from hatch_build import for_package_page
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).parents[1]
 PAGES = sorted(ROOT.glob("*.md"))
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)

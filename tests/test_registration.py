@@ -2,14 +2,13 @@
 
 import re
 import warnings
-from pathlib import Path
 
 import gymnasium as gym
 import pytest
 
 from dptse_env.registration import ENVIRONMENTS
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).parents[1]
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").glob("*.py")]
 
 
