@@ -6,7 +6,6 @@ dptse import trajectories --help
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import re
 import shlex
@@ -37,8 +36,6 @@ from dptse_env.utils.files import replacing, require_output
 from scripts.cli import Environment
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
-DATES = 1e8
-"""Times above are counted from a date [s], and not from the start of a file."""
 Shares = tuple[float, float, float]
 SHARES: Shares = (0.6, 0.2, 0.2)
 
@@ -101,7 +98,6 @@ class Trajectories(Environment):
                 print(f"{file['file']}: {remark}")
         for note in imported.report["notes"]:
             print(f"note: {note}")
-        print_overlap(imported.report)
         print_seeds(imported.seeds)
         print(f"road: {self.output / ROAD}\nreport: {self.output / REPORT}")
         print_next(self.output / ROAD, imported.seeds, imported.corridor, env, keywords)
@@ -273,19 +269,6 @@ def print_seeds(seeds: Mapping[str, tuple[int, ...]]) -> None:
     """Print the traffic seeds of each part."""
     for name, given in seeds.items():
         print(f"{name}: {len(given)} window(s), traffic seeds {ranges(given)}")
-
-
-def print_overlap(report: Mapping[str, Any]) -> None:
-    """Tell of windows of two files at one time, where times are dates and not those of a file."""
-    windows = sorted(report["windows"], key=lambda each: (each["group"], each["start"]))
-    for one, other in itertools.pairwise(windows):
-        same = one["group"] == other["group"] and one["file"] != other["file"]
-        if same and DATES < other["start"] <= one["start"] + report["duration"]:
-            print(
-                f"note: {one['file']} and {other['file']} overlap in time, from "
-                f"{other['start']:.10g} s on: the same vehicles may be in windows of both"
-            )
-            return
 
 
 def print_next(

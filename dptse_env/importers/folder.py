@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import errno
 import glob
+import itertools
 import os
 import shutil
 import uuid
@@ -33,6 +34,8 @@ from dptse_env.utils.files import require_output
 ROAD = "road.toml"
 NO_SPACE = 2**16
 """Free space below which a disk is full [bytes]."""
+DATES = 1e8
+"""Times above are counted from a date [s], and not from the start of a file."""
 SMALLEST_SHARE = 0.001
 """Exit shares must be above 0 and below 1: nobody or everybody leaving counts as this much."""
 
@@ -138,6 +141,7 @@ def import_trajectories(
         ]
         if empty:
             notes.append(f"windows begin on an empty mainline: traffic seeds {ranges(empty)}")
+        notes += overlaps(sources, corridor.duration)
 
         def load(seed: int) -> Record:
             return load_record(kept, seed, bare.record_layout)
@@ -182,6 +186,19 @@ def moved(road: Corridor, output: Path) -> Corridor:
     assert road.recordings is not None
     there = dataclasses.replace(road.recordings, folder=str(output.absolute()))
     return dataclasses.replace(road, recordings=there)
+
+
+def overlaps(windows: Iterable[Mapping[str, Any]], duration: float) -> list[str]:
+    """Return a note on the first windows [s] of two files that are at one time, by their dates."""
+    in_order = sorted(windows, key=lambda each: (each["group"], each["start"]))
+    for one, other in itertools.pairwise(in_order):
+        same = one["group"] == other["group"] and one["file"] != other["file"]
+        if same and DATES < other["start"] <= one["start"] + duration:
+            return [
+                f"{one['file']} and {other['file']} overlap in time, from {other['start']:.10g} s "
+                "on: the same vehicles may be in windows of both"
+            ]
+    return []
 
 
 def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corridor:
