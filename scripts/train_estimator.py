@@ -102,16 +102,20 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
     traffic, initial = parse_seeds(args.traffic, "traffic"), None
     if args.initial is not None:
         initial = member_for(args.initial, kind == "flows")
+    ranges = ScenarioRanges(envs=args.env) if args.env else ScenarioRanges()
+    with quietly():
+        roads = [make_config(*parse_env(each)).corridor for each in ranges.envs]
     plan = FilterPlan(
         kind=kind,
         seed=seed,
         traffic_seeds=traffic,
         validation_seeds=parse_seeds(args.validation, "validation"),
         validation_envs=args.validation_env,
-        ranges=ScenarioRanges(envs=args.env) if args.env else ScenarioRanges(),
+        ranges=ranges,
         rounds=tuple(parse_round(each) for each in args.rounds),
         width=FilterPlan.width if initial is None else read_network(initial).network.width,
         windows=min(FilterPlan.windows, len(traffic)),
+        seconds=min(FilterPlan.seconds, *(road.duration for road in roads)),
         initial=initial,
         **(CONTINUED if initial is not None else {}),
     )

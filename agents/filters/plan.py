@@ -270,3 +270,7 @@ class FilterPlan:
         with quietly():
             for cell in cells:
                 cell.check()
+            for env in self.ranges.envs:
+                most = make_config(*parse_env(env)).corridor.duration
+                allowed = f"at most {most} s, the length of a record of {env}"
+                require(self.seconds <= most, "plan.seconds", allowed, self.seconds)

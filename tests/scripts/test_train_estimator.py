@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from itertools import product
 
 import pytest
@@ -72,3 +73,12 @@ def test_rounds_are_read_from_text():
 def test_bad_arguments_are_named(more, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         make_plan(arguments(tmp_path, *more), "flows", 0)
+
+
+def test_an_episode_is_no_longer_than_the_records_of_the_roads(tmp_path):
+    short = arguments(tmp_path, "--env", SHORT)
+    assert make_plan(replace(short, plan="{}"), "flows", 0).seconds == 240
+    long = make_plan(replace(short, plan='{"seconds": 241}'), "flows", 0)
+    message = r"plan\.seconds must be at most 240 s, the length of a record of dptse_env:.*got 241"
+    with pytest.raises(ValueError, match=message):
+        long.check()
