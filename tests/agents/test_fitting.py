@@ -108,7 +108,8 @@ def test_the_same_command_plays_nothing_again_and_changes_no_file_of_yours(fitte
     path = shutil.copytree(original.parent, tmp_path / "copy") / original.name
     before = files_of(path.parent)
     done = run_command("fit", path, *BRIEF, "--json")
-    again = json.loads(done.stdout.replace(str(path.parent), str(original.parent)))
+    there, here = (json.dumps(str(each.parent))[1:-1] for each in (path, original))
+    again = json.loads(done.stdout.replace(there, here))
     assert again["test"] == found["test"]
     assert again["environment"].items() <= found["environment"].items()
     after = files_of(path.parent)

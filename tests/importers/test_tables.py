@@ -3,6 +3,8 @@
 import dataclasses
 import gzip
 import json
+import os
+import tempfile
 
 import numpy as np
 import polars as pl
@@ -304,14 +306,18 @@ def import_fcd(path, folder, road=SHORT_HIGHWAY, **fields):
     return RecordLibrary(folder).get(imported.corridor, 0)
 
 
+def output_to(path):
+    """Return options of SUMO, which runs in a temporary folder, with a name in plain ASCII."""
+    return "--fcd-output", f"../{os.path.relpath(path, tempfile.gettempdir())}", "--precision", "17"
+
+
 @pytest.fixture(scope="module")
 def fcd(tmp_path_factory):
     """Record a seed once for each kind of FCD file; return their folder and the record."""
     folder, options = tmp_path_factory.mktemp("fcd"), sumo.OPTIONS
     try:
         for suffix in ("xml", "csv", "parquet"):
-            output = "--fcd-output", str(folder / f"fcd.{suffix}"), "--precision", "17"
-            sumo.OPTIONS = (*options, *output)
+            sumo.OPTIONS = (*options, *output_to(folder / f"fcd.{suffix}"))
             record = simulate(SHORT_HIGHWAY, 3)
     finally:
         sumo.OPTIONS = options
@@ -367,8 +373,7 @@ def test_an_uneven_road_with_long_ramps_is_imported_number_for_number(tmp_path, 
         SHORT_HIGHWAY, segment_length=lengths, ramp_segments=(2, 3), duration=90
     )
     path = tmp_path / "fcd.csv"
-    output = "--fcd-output", str(path), "--precision", "17"
-    monkeypatch.setattr(sumo, "OPTIONS", (*sumo.OPTIONS, *output))
+    monkeypatch.setattr(sumo, "OPTIONS", (*sumo.OPTIONS, *output_to(path)))
     recorded = simulate(road, 0)
     record = import_fcd(path, tmp_path / "by-edge", road)
     for name in Record.COLUMNS:
