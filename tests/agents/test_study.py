@@ -44,21 +44,22 @@ def small(calls=None, **changes):
 
 
 def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
-    calls, place = [], Place(tmp_path, THIS_PROCESS)
+    folder = tmp_path / "a[1]"  # as a pattern it does not match itself
+    calls, place = [], Place(folder, THIS_PROCESS)
     first = small(calls)
     run(first, place, progress=False)
-    rows = rows_of(tmp_path)
+    rows = read_rows("small", folder).sort("bandwidth", "traffic_seed")
     expected = [row for cell in first.cells for row in play(cell, first.seeds)]
     assert rows.select("bandwidth", "traffic_seed").rows() == [
         (1, 2000), (1, 2001), (2, 2000), (2, 2001),
     ]  # fmt: skip
     assert set(rows["version"]) == {versions.code_version()}
     assert rows["reward"].to_list() == [row["reward"] for row in expected]
-    tables = (tmp_path / "tables.md").read_text("utf-8")
+    tables = (folder / "tables.md").read_text("utf-8")
     assert f"| 1 | {rows['rmse_density'][:2].mean():.6f} |" in tables
     assert "| 9 | - |" in tables
-    assert not (tmp_path / "rows").exists()
-    assert calls == [tmp_path]
+    assert not (folder / "rows").exists()
+    assert calls == [folder]
 
 
 def test_rows_of_equal_numbers_count_as_played_and_others_do_not(tmp_path, monkeypatch):
