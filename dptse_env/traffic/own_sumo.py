@@ -81,9 +81,10 @@ _MEASURES = re.compile(rf"(has|(person-)?device)\.(?!({_DEVICES})\.)")
 """Keys of parameters of devices that change no traffic."""
 _ELSEWHERE = re.compile(r"\s*([/\\~]|[A-Za-z]:[/\\])|(.*[/\\])?\.\.([/\\]|$)|.*(\$|://)")
 """Values of parameters that name a place outside of the folder that SUMO runs in."""
+_INTERVAL = "interval"
 _DEPARTURES = {
     **dict.fromkeys(("vehicle", "trip", "person", "container"), "depart"),
-    **dict.fromkeys(("flow", "personFlow", "containerFlow"), "begin"),
+    **dict.fromkeys(("flow", "personFlow", "containerFlow", _INTERVAL), "begin"),
 }
 """Attribute with the departure, by element."""
 
@@ -422,13 +423,13 @@ def copy_input(path: Path, copy: Path, begin: float) -> Copied:
                 elif event == "end" and depth == 1:
                     found.n_elements += 1
                     is_left = _without_files(element, found)
-                    moves = element.tag in _DEPARTURES
-                    departure = _departure(element, begin) if moves else None
-                    if departure is not None:
-                        found.is_sorted &= departure >= last
-                        last = departure
-                    if is_left:
-                        text = ElementTree.tostring(element, encoding="unicode").strip()
+                    for part, inner, default in _apart(element, begin) if is_left else ():
+                        moves = inner.tag in _DEPARTURES
+                        departure = _departure(inner, default) if moves else None
+                        if departure is not None:
+                            found.is_sorted &= departure >= last
+                            last = departure
+                        text = ElementTree.tostring(part, encoding="unicode").strip()
                         parts.append((last if moves else -inf, text))
                     root.clear()
     except (*UNREADABLE, RecursionError) as error:
@@ -473,7 +474,24 @@ def _without_files(element: ElementTree.Element, found: Copied) -> bool:
     return True
 
 
-def _departure(element: ElementTree.Element, begin: float) -> float | None:
+def _apart(
+    element: ElementTree.Element, begin: float | None
+) -> Iterator[tuple[ElementTree.Element, ElementTree.Element, float | None]]:
+    """Yield an element twice, and the begin of flows that have none.
+
+    Of an interval, which has this begin for its flows, they are those with one of its elements
+    each, and this element.
+    """
+    if element.tag != _INTERVAL:
+        yield element, element, begin
+        return
+    for inner in element:
+        part = ElementTree.Element(_INTERVAL, element.attrib)
+        part.append(inner)
+        yield part, inner, _departure(element, begin)
+
+
+def _departure(element: ElementTree.Element, begin: float | None) -> float | None:
     """Return when a vehicle, a person or a flow departs [s]; None if an event starts it."""
     given = element.get(_DEPARTURES[element.tag])
     if given is None:

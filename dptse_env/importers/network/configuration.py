@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,7 +120,7 @@ def read_configuration(path: Path) -> Files:
             raise ValueError(f"{where}: {name} must be left out: it is {meaning}")
 
     def paths(name: str) -> tuple[Path, ...]:
-        names = re.split(r"[,;]\s*|\s+(?=\S)", values.pop(name, "").strip())
+        names = map(str.strip, values.pop(name, "").split(","))  # as SUMO does
         return tuple(path.parent / each for each in names if each)
 
     files = {name: paths(name) for name in ("net-file", "route-files", "additional-files")}

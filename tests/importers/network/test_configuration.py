@@ -11,8 +11,8 @@ from dptse_env.importers.network import Files, read_configuration
 CONFIGURATION = """
 <configuration>
     <input>
-        <net-file value="net/road.net.xml"/>
-        <route-files value="a.rou.xml, b.rou.xml"/>
+        <net-file value=" a net/the road;1.net.xml "/>
+        <route-files value="a.rou.xml, b c.rou.xml"/>
         <additional-files v="types.add.xml"/>
     </input>
     <output><fcd-output value="fcd.xml"/><tripinfo value="trips.xml"/></output>
@@ -39,8 +39,8 @@ def read(folder, *change):
 def test_a_configuration_gives_files_and_options_of_the_traffic(tmp_path):
     files = read(tmp_path)
     assert files == Files(
-        net=tmp_path / "net/road.net.xml",
-        routes=(tmp_path / "a.rou.xml", tmp_path / "b.rou.xml"),
+        net=tmp_path / "a net/the road;1.net.xml",
+        routes=(tmp_path / "a.rou.xml", tmp_path / "b c.rou.xml"),
         additional=(tmp_path / "types.add.xml",),
         begin=25200.0,
         step_length=0.5,
@@ -59,7 +59,7 @@ def test_a_configuration_gives_files_and_options_of_the_traffic(tmp_path):
     ("change", "message"),
     [
         (('"07:00:00"', '"seven"'), ": begin must be seconds or hh:mm:ss, got 'seven'"),
-        (('<net-file value="net/road.net.xml"/>', ""), " must name one net-file, got 0"),
+        (("net-file", "no-file"), " must name one net-file, got 0"),
         (("<processing>", '<processing><mesosim value="true"/>'), ": mesosim must be left out"),
         (("</configuration>", ""), " must be XML"),
         (("configuration>", "net>"), " must be a <configuration> of SUMO, got <net>"),

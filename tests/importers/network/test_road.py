@@ -368,6 +368,18 @@ def taken(option):
     return TRAFFIC.fullmatch(option) is not None
 
 
+def test_flows_of_intervals_depart_in_order_among_vehicles(tmp_path):
+    def at(begin, flow):
+        return f'<interval begin="{begin}" end="300">{flow}</interval>'
+
+    own, plain, vehicle, route = '<flow begin="70"/>', "<flow/>", "<vehicle depart='99'/>", "<route/>"
+    given, copy = tmp_path / "given.xml", tmp_path / "copy.xml"
+    given.write_text(f"<all>{at('0:02:30', plain + own)}{at(50, plain)}{vehicle}{plain}{route}</all>")
+    assert not copy_input(given, copy, 60.0).is_sorted
+    in_order = [route, at(50, plain), plain, at("0:02:30", own), vehicle, at("0:02:30", plain)]
+    assert canonicalize(copy.read_text()) == canonicalize(f"<all>{''.join(in_order)}</all>")
+
+
 @pytest.mark.parametrize("place", ["{root}/kept.xml", "{root}/missing/new.xml", "kept.xml"])
 def test_nothing_that_files_name_is_written(files, place, tmp_path, monkeypatch):
     root = tmp_path / "theirs"
