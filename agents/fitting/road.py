@@ -193,7 +193,7 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
 
 def _lies_in(value: Any, folder: Path) -> bool:
     """Return whether a value names a file in a folder."""
-    return isinstance(value, str) and Path(value).is_relative_to(folder.absolute())
+    return isinstance(value, str) and Path(value).resolve().is_relative_to(folder.resolve())
 
 
 def _check_road(path: Path, corridor: Corridor) -> None:

@@ -19,15 +19,9 @@ TABLE, DWELL, MEASURED = "environment", "average_dwell", "measured"
 
 
 def copy_of(path: Path) -> Path:
-    """Return where the copy of a road file is kept."""
+    """Return where the copy of a road file is kept, for a link beside the file."""
+    path = Path(os.path.realpath(path))
     return path.with_name(f"{path.stem}.before-fit{path.suffix}")
-
-
-def from_home(path: Path, file: Path) -> str:
-    """Return the path of a file from the folder of a road file on, as its table has it."""
-    target, home = file.absolute(), path.absolute().parent
-    same_drive = target.drive == home.drive
-    return Path(os.path.relpath(target, home)).as_posix() if same_drive else target.as_posix()
 
 
 def write_choice(path: Path, keywords: Mapping[str, Any], dwell: float | None) -> bool:

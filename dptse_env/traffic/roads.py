@@ -207,7 +207,8 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
     try:
         for key in PARTS:
             require_registered(environment.get(key), f"{path}: {_ENVIRONMENT}.{key}")
-        keywords = {key: _absolute(value, path.parent) for key, value in environment.items()}
+        home = path.resolve().parent
+        keywords = {key: _absolute(value, home) for key, value in environment.items()}
     except RecursionError as problem:
         raise ValueError(f"{path}: {_ENVIRONMENT} must not be nested so deeply") from problem
     return RoadFile(corridor, keywords, assumed)
@@ -235,15 +236,22 @@ def write_corridor(
     content = _plain(dataclasses.asdict(corridor))
     for name in _WITH_FOLDER:
         given = getattr(corridor, name)
-        if given is None:
-            continue
-        folder, home = Path(given.folder).resolve(), Path(path).resolve().parent
-        if folder.is_relative_to(home.parent):  # so that both can be moved together
-            content[name]["folder"] = Path(os.path.relpath(folder, home)).as_posix()
+        if given is not None:
+            content[name]["folder"] = from_home(path, given.folder)
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())
     write_atomically(path, head + tomli_w.dumps(content))
+
+
+def from_home(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> str:
+    """Return the path of a file or folder from the folder of a road file on, without links.
+
+    So they can be moved together. On another drive it is absolute.
+    """
+    target, home = Path(file).resolve(), Path(path).resolve().parent
+    same_drive = target.drive == home.drive
+    return Path(os.path.relpath(target, home)).as_posix() if same_drive else target.as_posix()
 
 
 def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:
@@ -252,7 +260,7 @@ def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[s
     for name in _WITH_FOLDER:
         given = fields.get(name)
         if isinstance(given, Mapping) and isinstance(given.get("folder"), str):
-            folder = str((path.parent / given["folder"]).resolve())
+            folder = str((path.resolve().parent / given["folder"]).resolve())
             fields[name] = {**given, "folder": folder}
     if "name" not in fields:
         fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")

@@ -274,7 +274,10 @@ def test_a_choice_is_written_whatever_the_file_looks_like(text, tmp_path):
     path = tmp_path / "road.toml"
     path.write_bytes(text.encode())
     chosen = {"parameters": "fit/a.json", "estimator": "ekf"}
-    assert write_choice(path, chosen, 9.8)
+    link = tmp_path / "link.toml"
+    link.symlink_to(path)
+    assert write_choice(link, chosen, 9.8)
+    assert copy_of(link) == tmp_path / "road.before-fit.toml"
     assert copy_of(path).read_bytes() == text.encode()
     new, old = tomllib.loads(path.read_bytes().decode()), tomllib.loads(text)
     assert new.pop("average_dwell") == 9.8

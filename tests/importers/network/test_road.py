@@ -271,11 +271,14 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
     write_corridor(folder / "road.toml", corridor)
     assert str(tmp_path) not in (folder / "road.toml").read_text()
     assert read_corridor(folder / "road.toml") == corridor
-    beside = tmp_path / "roads" / "road.toml"
-    beside.parent.mkdir()
-    write_corridor(beside, corridor)
-    assert 'folder = "../here"' in beside.read_text()
-    assert read_corridor(beside) == corridor
+    below = tmp_path / "roads" / "mine" / "road.toml"
+    below.parent.mkdir(parents=True)
+    write_corridor(below, corridor)
+    assert 'folder = "../../here"' in below.read_text()
+    (tmp_path / "link.toml").symlink_to(below)
+    assert read_corridor(tmp_path / "link.toml") == corridor
+    write_corridor(tmp_path / "link.toml", corridor, {"bandwidth": 3})
+    assert (read_corridor(below), "bandwidth" in below.read_text()) == (corridor, True)
     moved = read_corridor(folder.rename(there) / "road.toml")
     assert Path(moved.network.folder) == there
     assert moved.digest == road.corridor.digest
@@ -372,9 +375,12 @@ def test_flows_of_intervals_depart_in_order_among_vehicles(tmp_path):
     def at(begin, flow):
         return f'<interval begin="{begin}" end="300">{flow}</interval>'
 
-    own, plain, vehicle, route = '<flow begin="70"/>', "<flow/>", "<vehicle depart='99'/>", "<route/>"
+    own, plain = '<flow begin="70"/>', "<flow/>"
+    vehicle, route = '<vehicle depart="99"/>', "<route/>"
     given, copy = tmp_path / "given.xml", tmp_path / "copy.xml"
-    given.write_text(f"<all>{at('0:02:30', plain + own)}{at(50, plain)}{vehicle}{plain}{route}</all>")
+    given.write_text(
+        f"<all>{at('0:02:30', plain + own)}{at(50, plain)}{vehicle}{plain}{route}</all>"
+    )
     assert not copy_input(given, copy, 60.0).is_sorted
     in_order = [route, at(50, plain), plain, at("0:02:30", own), vehicle, at("0:02:30", plain)]
     assert canonicalize(copy.read_text()) == canonicalize(f"<all>{''.join(in_order)}</all>")
