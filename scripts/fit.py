@@ -33,7 +33,7 @@ from agents.fitting.choice import (
 from agents.fitting.page import Outcome, answer, write
 from agents.fitting.parameters import Fit, fit_parameters, is_stable, start_from, traffic_of
 from agents.fitting.road import PLAYED, Road, find_road
-from agents.fitting.road_file import copy_of, from_home, write_choice
+from agents.fitting.road_file import copy_of, write_choice
 from agents.play import record
 from agents.study import Place
 from agents.tables import ERROR, Labels, values
@@ -43,6 +43,7 @@ from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.parameters import read_parameters, write_parameters
 from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import RecordLibrary, ranges
+from dptse_env.traffic.roads import from_home
 from dptse_env.utils.fields import integer, require
 from dptse_env.utils.files import replacing, require_output, write_atomically
 from dptse_env.versions import code_version
@@ -95,7 +96,8 @@ def main(args: Args) -> None:
     seeds = {"training": args.training, "validation": args.validation, "test": args.test}
     road, stages = find_road(args.road, args.env, folder, seeds), folder / STAGES
     require_output(folder, own=[STAGES])
-    require_output(args.road.parent, ())
+    copy = copy_of(args.road)
+    require_output(copy.parent, [copy.name], force=True)
     road.check(stages, args.tries)
     place = args.place(stages)
 
@@ -132,7 +134,7 @@ def main(args: Args) -> None:
     for note in notes:
         print(f"- {note}")
     if changed:
-        print(f"{args.road} has the table [environment] now; {copy_of(args.road)} is as it was")
+        print(f"{args.road} has the table [environment] now; {copy} is as it was")
     print(f"open {folder / PAGE} in a browser: it says what to do next")
 
 
@@ -326,4 +328,4 @@ def commands(args: Args, choice: Choice, folder: Path) -> list[tuple[str, str]]:
 def _in_file(path: Path, value: Any) -> Any:
     """Return a value as the road file has it: names of files start at its folder."""
     is_file = isinstance(value, str) and value.endswith(".json")
-    return from_home(path, Path(value)) if is_file else value
+    return from_home(path, value) if is_file else value

@@ -13,6 +13,7 @@ depend on the order in which earlier ones end.
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -83,7 +84,7 @@ def make_searches(args: Args) -> dict[str, Search]:
 def main(args: Args) -> None:
     """Record what is missing, run the trials that are missing, and write the sets."""
     searches, executor = make_searches(args), make_executor("local", args.workers)
-    foreign = [name for name, s in searches.items() if not journal_path(s, args.output).exists()]
+    foreign = [n for n, s in searches.items() if not os.path.lexists(journal_path(s, args.output))]
     require_output(args.output, [f"{name}.json" for name in foreign], force=args.force)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     columns = "set", "settings", "reward", "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"

@@ -9,7 +9,6 @@ import glob
 import itertools
 import os
 import shutil
-import uuid
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ from dptse_env.traffic.imported import Kind, load_record, ranges, save_record, w
 from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.fields import require, require_name
-from dptse_env.utils.files import require_output
+from dptse_env.utils.files import hidden, require_output
 
 ROAD = "road.toml"
 NO_SPACE = 2**16
@@ -287,7 +286,7 @@ def new_folder(output: Path) -> Iterator[Path]:
     """
     require_output(output.parent, [output.name])
     output.parent.mkdir(parents=True, exist_ok=True)
-    work = output.parent / f".{output.name}-{uuid.uuid4().hex}"
+    work = hidden(output)
     for left in output.parent.glob(f".{glob.escape(output.name)}-{'[0-9a-f]' * 32}"):
         shutil.rmtree(left, ignore_errors=True)
     folder = work / "result"

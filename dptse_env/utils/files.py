@@ -13,7 +13,7 @@ import stat
 import tempfile
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,13 +64,16 @@ def _lowest_there(path: Path) -> Path:
     try:
         path.lstat()
     except FileNotFoundError:
-        return _lowest_there(path.parent)
+        place = _lowest_there(path.parent)
+        with contextlib.suppress(FileNotFoundError):
+            (place / path.name).lstat()  # an error where the name is too long
+        return place
     return path
 
 
 def require_output(
     folder: Path,
-    names: Iterable[str] | None = None,
+    names: Sequence[str] | None = None,
     *,
     own: Iterable[str] = (),
     force: bool | None = None,
@@ -86,9 +89,15 @@ def require_output(
         force: Whether files may be replaced; None where nobody can allow it.
 
     Raises:
-        ValueError: Something else is there, or nothing can be written there.
+        ValueError: Something else is there, nothing can be written there, or a name is too long.
     """
     require_writable("output", folder)
+    for path in map(folder.joinpath, names or ()):
+        try:
+            _lowest_there(hidden(path))
+        except OSError as problem:
+            found = f"{path}: {problem.strerror}"
+            raise ValueError(f"output must have another name, got {found}") from problem
     if any((folder / name).exists() for name in own):
         return
     if names is None:
@@ -262,6 +271,11 @@ def _depth(node: Any) -> int:
     return 1 + max(map(_depth, node), default=0)
 
 
+def hidden(path: Path) -> Path:
+    """Return where something is made that takes the place of `path` when it is complete."""
+    return path.with_name(f".{path.name}-{uuid.uuid4().hex}")
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path, whose file takes the place of `path` when the body is done.
@@ -269,15 +283,15 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         OSError: The file cannot be written, and the error names it; the old one stays.
     """
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}-{uuid.uuid4().hex}")
+    target = Path(os.path.realpath(path))  # a link stays one
+    temporary = hidden(target)
     try:
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         _take_place(temporary, target)
     except OSError as problem:
-        problem.filename = os.fspath(target)  # a full disk names none, others the temporary one
+        problem.filename = os.fspath(path)  # a full disk names none, others the temporary one
         raise
     finally:
         temporary.unlink(missing_ok=True)
