@@ -15,9 +15,10 @@ from agents.environments import make_config, make_vector, quietly
 from agents.policies import NamedSchedule, find_policy
 from agents.watchers import WATCHERS
 from dptse_env.estimators.recurrent import member_for, read_network, shipped_networks
-from dptse_env.evaluation import Row, evaluate
+from dptse_env.evaluation import WARM_UP, Row, evaluate
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.traffic import Corridor, RecordLibrary, Records, open_library
+from dptse_env.utils.fields import require
 from dptse_env.utils.files import file_digest
 
 POLICY_SEED = 0
@@ -89,14 +90,16 @@ class Cell:
 
         Raises:
             FileNotFoundError: There is no such policy.
-            ValueError: A keyword is unknown or out of range, or the policy is unknown or does not
-                suit the environment.
+            ValueError: A keyword is unknown or out of range, an episode is too short, or the policy
+                is unknown or does not suit the environment.
         """
         unknown = [name for name in self.watchers if name not in WATCHERS]
         if unknown:
             raise ValueError(f"watchers must be of {', '.join(WATCHERS)}, got {unknown[0]!r}")
         with quietly():
             env = make_vector(self.env, 1, self.all_keywords)
+            seconds, allowed = env.config.horizon_steps, f"above the {WARM_UP} s that do not count"
+            require(seconds > WARM_UP, "horizon or the road's duration", allowed, seconds)
             env.process  # noqa: B018 (an estimator refuses a road when it is made)
             self.load_policy(env)
 

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.audit.report import audit_environment, audit_one_run, check_target
-from agents.environments import make_config, parse_env
-from agents.play import Cell
+from agents.environments import make_config, make_vector, parse_env, quietly
 from dptse_env.parts import privacy_report
 from dptse_env.utils.fields import inside, integer, positive, require
 from dptse_env.utils.files import require_output
@@ -63,7 +62,8 @@ def main(args: Args) -> None:
     positive("noise_factor", args.noise_factor)
     inside("confidence", args.confidence, 0.0, 1.0)
     env, keywords = parse_env(args.env)
-    Cell(env, "none", keywords).check()
+    with quietly():
+        make_vector(env, 1, keywords).process  # noqa: B018 (an estimator may refuse the road)
     config = make_config(env, keywords)
     if args.one_run:
         for name in ("target", "policy", "runs"):

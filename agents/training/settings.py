@@ -520,8 +520,6 @@ class TrainingPlan:
         worlds: list[World] = []
         for env, keywords in map(parse_env, self.envs):
             config = make_config(env, {**chosen, **keywords})
-            allowed = f"above {WARM_UP} s, the warm-up of a validation"
-            require(config.horizon_steps > WARM_UP, "horizon", allowed, config.horizon_steps)
             first = worlds[0].config if worlds else config
             share = first.corridor.n_mainline / config.corridor.n_mainline
             worlds.append(World(env, keywords, config, share))

@@ -192,6 +192,7 @@ def test_estimators_and_keywords_reach_the_environment():
         (["--policies", "a/b.safetensors", "c/a/b.safetensors"], "'a/b'"),
         (["--policies", "nobody.safetensors"], "nobody.safetensors"),
         (["--policies", "nobody"], "'nobody'"),
+        (["--env", f'{SHORT} {{"horizon": 60}}'], "horizon or the road's duration must be above"),
     ],
 )
 def test_bad_arguments_are_named_and_nothing_is_written(words, message, tmp_path):

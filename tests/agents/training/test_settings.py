@@ -87,7 +87,7 @@ def env(**keywords):
         ({"envs": env(action="mask")}, "env: action is chosen by the training"),
         ({"envs": (f"{SHORT} 3",)}, "env must be an id and a JSON object, got"),
         ({"envs": env(estimatr="ukf")}, "estimatr is unknown"),
-        ({"envs": env(horizon=60)}, "horizon must be above 60 s, .*, got 60"),
+        ({"envs": env(horizon=60)}, "horizon or the road's duration must be above the 60 s"),
         ({"envs": (ENV, *env(privacy="paced"))}, "env: .*paced.*: .* the same channels"),
         (
             {"envs": (ENV, OTHER), "algorithm": make_algorithm("ppo"), "steps": 9},
