@@ -26,7 +26,7 @@ from dptse_env.sb3.road_policy import MOST_NEIGHBOURS, RoadChannels, RoadPolicy,
 from dptse_env.spaces.actions import ACTION_ENCODINGS, MaskAction, PendingPicks
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import Action, AnyArray, BoolArray, FloatArray, Observation
-from dptse_env.utils.fields import integer, require_name, shown
+from dptse_env.utils.fields import integer, require, require_name, shown
 from dptse_env.utils.files import require_arrays, write_tensors
 from dptse_env.utils.registry import needed_for, require_registered
 from dptse_env.versions import versions_with
@@ -426,7 +426,7 @@ def load_policy(
         interface = make_interface(config)
         return ActingPolicy(policy, interface, file.card, normalisation, make_interface(own))
     except ValueError as problem:
-        raise ValueError(f"policy {file.source!r} cannot be loaded: {problem!s:.1000}") from problem
+        raise ValueError(f"policy {file.source!r} cannot be loaded: {problem}") from problem
 
 
 def describe_road(corridor: Corridor) -> str:
@@ -488,7 +488,7 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
     refused = {key: pair for key, pair in differences.items() if key not in allow}
     if refused:
         text = "; ".join(
-            f"{key} is {there!r:.300} for the policy and {here!r:.300} for the environment"
+            f"{key} is {shown(there)} for the policy and {shown(here)} for the environment"
             for key, (there, here) in refused.items()
         )
         if all(key in TRANSFERABLE for key in refused):
@@ -535,7 +535,7 @@ def _actor(policy: BasePolicy, kind: Kind) -> dict[str, AnyArray]:
     weights = policy.state_dict()
     unknown = [key for key in weights if not key.startswith((*kind.actor, *kind.rest))]
     if unknown:
-        raise ValueError(f"policy has weights of unknown parts: {', '.join(unknown)!s:.200}")
+        raise ValueError(f"policy has weights of unknown parts: {shown(unknown)}")
     return {
         key: value.detach().cpu().numpy()
         for key, value in weights.items()
@@ -552,8 +552,7 @@ def _made(
         ValueError: An argument is unknown or out of range, or the weights are others.
     """
     name, arguments = card["policy"]["class"], card["policy"]["arguments"]
-    if name not in KINDS:
-        raise ValueError(f"policy.class must be one of {', '.join(KINDS)}, got {name!r:.80}")
+    require_name("policy.class", name, KINDS)
     kind, interface, weights = KINDS[name], make_interface(config), dict(arrays)
     action = ACTION_ENCODINGS.name_of(config.action)
     if kind.actions and action not in kind.actions:
@@ -587,8 +586,8 @@ def _check_shared(arguments: Mapping[str, Any], kind: Kind, n_values: int) -> No
     reach = integer("policy.arguments.reach", arguments["reach"], 1, MOST_NEIGHBOURS)
     # Of the trunk's second convolution and of its mean.
     _check_size(2 * (reach + 1) * width * width, n_values)
-    if not isinstance(skips := arguments["skips_sensors"], bool):
-        raise ValueError(f"policy.arguments.skips_sensors must be a bool, got {skips!r:.80}")
+    skips = arguments["skips_sensors"]
+    require(isinstance(skips, bool), "policy.arguments.skips_sensors", "a bool", skips)
 
 
 def _perceptron(
@@ -597,8 +596,7 @@ def _perceptron(
     kind, n_actions = KINDS[name], interface.actions.n_options
     _check_names(arguments, ("layers", "units", *kind.sizes))
     layers, units = arguments["layers"], arguments["units"]
-    if not isinstance(layers, list):
-        raise ValueError(f"policy.arguments.layers must be a list of widths, got {layers!r:.80}")
+    require(isinstance(layers, list), "policy.arguments.layers", "a list of widths", layers)
     integer("policy.arguments.layers: their number", len(layers), 0, MOST_LAYERS)
     widths = [integer(f"policy.arguments.layers[{k}]", w, 1) for k, w in enumerate(layers)]
     sizes = {size: integer(f"policy.arguments.{size}", arguments[size], 1) for size in kind.sizes}
@@ -631,14 +629,11 @@ def _perceptron(
 
 
 def _check_names(arguments: Mapping[str, Any], expected: Sequence[str]) -> None:
-    if set(arguments) != set(expected):
-        raise ValueError(
-            f"policy.arguments must be {', '.join(sorted(expected))}, got "
-            f"{', '.join(map(repr, arguments))!s:.80}"
-        )
+    fits = set(arguments) == set(expected)
+    require(fits, "policy.arguments", ", ".join(sorted(expected)), [*arguments])
 
 
 def _check_size(wanted: int, n_values: int) -> None:
     """Refuse a network of more weights than a file has, before it takes memory."""
-    if wanted > n_values:
-        raise ValueError(f"policy.arguments describe {shown(wanted)} weights, it has {n_values}")
+    described = "the number of weights that policy.arguments describe"
+    require(wanted <= n_values, described, f"at most {n_values}", wanted)
