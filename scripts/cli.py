@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import signal
 import sys
 import warnings
@@ -70,8 +71,9 @@ class Recording:
         """
         if self.workers is not None:
             integer("workers", self.workers, 1)
-        if self.records is not None and not self.records.is_dir():
-            require_writable("records", self.records)
+        given = self.records
+        if given is not None and not os.path.isdir(given):  # noqa: PTH112 (it may be too long)
+            require_writable("records", given)
 
     def library(self, corridor: Corridor, seeds: Sequence[int]) -> RecordLibrary:
         """Return the library of records, after recording what is missing."""
