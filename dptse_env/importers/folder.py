@@ -286,7 +286,7 @@ def new_folder(output: Path) -> Iterator[Path]:
     """
     require_output(output.parent, [output.name])
     output.parent.mkdir(parents=True, exist_ok=True)
-    work = hidden(output)
+    work = hidden(output.absolute())
     for left in output.parent.glob(f".{glob.escape(output.name)}-{'[0-9a-f]' * 32}"):
         shutil.rmtree(left, ignore_errors=True)
     folder = work / "result"

@@ -6,6 +6,7 @@ time. What grows in memory is a row for each vehicle and for each second.
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections import Counter
 from dataclasses import dataclass, field
@@ -124,7 +125,7 @@ class Recording:
     def record(self, window: int) -> Record:
         """Return the record of a window."""
         c = pl.col
-        rows = pl.scan_parquet(self.folder / "seconds" / "*.parquet")
+        rows = pl.scan_parquet(sorted(self.folder.glob("seconds/*.parquet")), glob=False)
         rows = rows.filter(c("window") == window).sort(
             "step", "column", "lane", "position", maintain_order=True
         )
@@ -187,15 +188,18 @@ class Recording:
             parquet = self.path.suffix.lower() in tables.PARQUET
             what = "it is no complete Parquet file: " if parquet else ""
             reason = cut(str(problem).partition("\n")[0])
+            what = "it must be text in UTF-8, got " if "invalid utf-8" in reason else what
             raise TrajectoryError(f"{self.path}: {what}{reason}") from problem
         if not (self.folder / "points").is_dir():
             raise TrajectoryError(f"{self.path}: it must have rows of vehicles, got none")
-        self._points = pl.scan_parquet(self.folder / "points" / "**" / "*.parquet")
+        files = sorted(self.folder.glob("points/*/*.parquet"))
+        self._points = pl.scan_parquet(files, glob=False)
         bad = self._points.filter(c("bad").is_not_null()).bottom_k(1, by="row")
         for row, role in bad.select("row", "bad").collect(engine="streaming").rows():
             name, text_of = tables.field_text(self.path, self._form, self.source, row, role)
+            point = " with a point" if re.fullmatch(r"'-?\d*,\d*'", text_of) else ""
             raise TrajectoryError(
-                f"{self.path}, row {row}: {name} must be a finite number, got {text_of}"
+                f"{self.path}, row {row}: {name} must be a finite number{point}, got {text_of}"
             )
         return n_buckets
 
@@ -278,7 +282,12 @@ class Recording:
     def _require_joined(self) -> None:
         """Refuse a file in which points are mostly too far apart to be trajectories."""
         cut, followed = self.counts["gaps_cut"] + self.counts["jumps_cut"], self.counts["followed"]
-        if 2 * cut > followed or followed == 0:
+        if followed == 0:
+            raise TrajectoryError(
+                f"{self.path}: an id must be that of a vehicle in several rows on the road, got "
+                "none that is: is the column of the vehicle right?"
+            )
+        if 2 * cut > followed:
             raise TrajectoryError(
                 f"{self.path}: points of a vehicle must mostly follow one another within "
                 f"{self.options.longest_gap:g} s at less than 300 km/h, got {followed - cut} of "
@@ -357,7 +366,9 @@ class Recording:
         """Write the seconds of a bucket that are in windows; return the pieces of trajectories."""
         c = pl.col
         files = self.folder / "points" / f"bucket={bucket}"
-        points = pl.read_parquet(files) if files.is_dir() else self._points.head(0).collect()
+        points = (
+            pl.read_parquet(files, glob=False) if files.is_dir() else self._points.head(0).collect()
+        )
         points = points.filter(c("vehicle").is_not_null(), c("group").is_in(list(coverage)))
         time = ((c("time") + self.shift - self.base) / TIME_UNIT).round() * TIME_UNIT
         near = (c("time") - c("time").round()).abs() < 0.1 * TIME_UNIT

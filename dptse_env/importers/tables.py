@@ -179,7 +179,9 @@ def _raw(path: Path, form: Format, source: Source) -> _Raw:
             raise TrajectoryError(f"{path}: the file is empty")
         kind = "".join(path.suffixes[-2:]).lower().removesuffix(".gz")
         if kind.endswith(PARQUET):
-            frame = pl.scan_parquet(path, row_index_name=ROW, row_index_offset=1)
+            frame = pl.scan_parquet(
+                path.absolute(), glob=False, row_index_name=ROW, row_index_offset=1
+            )
             return _Raw(frame, frame.select(pl.len()).collect().item())
         if kind.endswith(".xml"):
             return _Raw(_from(lambda: _xml(path, form)), size // BYTES)
@@ -195,6 +197,8 @@ def _raw(path: Path, form: Format, source: Source) -> _Raw:
 def _text(path: Path, form: Format) -> _Raw:
     with _open(path) as file:
         text = file.read(HEAD).decode("utf-8-sig", errors="replace")
+    if "\0" in text:
+        raise TrajectoryError(f"{path}: it must be text in UTF-8, got bytes of 0, as in UTF-16")
     first = text.partition("\n")[0].rstrip("\r")
     if not first.strip():
         raise TrajectoryError(f"{path}, row 1: a header or data must be there, got an empty line")
@@ -216,15 +220,16 @@ def _text(path: Path, form: Format) -> _Raw:
     rows = _count_rows(path, None if blanks else separator, len(names))
     options: dict[str, Any] = {
         "infer_schema": False, "has_header": has_header, "row_index_name": ROW,
-        "row_index_offset": 1 + has_header,
+        "row_index_offset": 1 + has_header, "glob": False,
     }  # fmt: skip
+    file = path.absolute()  # since polars expands ~
     if not blanks:
-        raw = pl.scan_csv(path, separator=separator, new_columns=names, **options)
+        raw = pl.scan_csv(file, separator=separator, new_columns=names, **options)
         # "1,118,846,663,000": portals export numbers with their digits in groups.
         grouped = separator == "," and re.search(r'"\d{1,3}(,\d{3})+(\.\d*)?"', text) is not None
         return _Raw(raw, rows, grouped)
     # Runs of blanks: a line is one column first.
-    raw = pl.scan_csv(path, separator="\x01", quote_char=None, new_columns=["line"], **options)
+    raw = pl.scan_csv(file, separator="\x01", quote_char=None, new_columns=["line"], **options)
     fields = pl.col("line").str.extract_all(r"\S+")
     columns = (fields.list.get(i, null_on_oob=True).alias(name) for i, name in enumerate(names))
     return _Raw(raw.select(ROW, *columns), rows)
@@ -243,8 +248,8 @@ def _count_rows(path: Path, separator: str | None, n: int) -> int:
         # A quote that its line does not close would join it with the next ones.
         found = pl.when(bare.str.contains('"', literal=True)).then(0).otherwise(fields)
     lines = pl.scan_csv(
-        path, separator="\x01", quote_char=None, has_header=False, new_columns=["line"],
-        infer_schema=False, row_index_name="row", row_index_offset=1,
+        path.absolute(), separator="\x01", quote_char=None, has_header=False, glob=False,
+        new_columns=["line"], infer_schema=False, row_index_name="row", row_index_offset=1,
     )  # fmt: skip
     wrong = pl.col("n") != n
     told = (
@@ -485,7 +490,9 @@ def _by_direction(points: pl.LazyFrame, path: Path, source: Source) -> pl.LazyFr
     """Turn the front of each vehicle of highD into a position in its direction of travel."""
     meta = path.with_name(path.name.replace("_tracks.", "_tracksMeta."))
     try:
-        table = pl.read_csv(meta, infer_schema=False, columns=["id", "drivingDirection"])
+        table = pl.read_csv(
+            meta.absolute(), glob=False, infer_schema=False, columns=["id", "drivingDirection"]
+        )
     except (OSError, pl.exceptions.PolarsError) as problem:
         raise TrajectoryError(
             f"{path}: the driving directions must be in {meta} (columns id, drivingDirection), "

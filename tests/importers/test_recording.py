@@ -153,6 +153,14 @@ def test_one_id_for_all_vehicles_is_told_before_speeds_are_judged(tmp_path):
         run(plain(tmp_path / "a.csv", points))
 
 
+def test_an_id_of_its_own_in_each_row_is_told(tmp_path):
+    points = stream()
+    points[:, 0] = np.arange(len(points))
+    message = r"a\.csv: an id must be .* in several rows .*, got none that is"
+    with pytest.raises(TrajectoryError, match=message):
+        run(plain(tmp_path / "a.csv", points))
+
+
 @pytest.mark.parametrize("text", ["{}.0", " {} ", "0{}", "{}.000e+00"])
 def test_codes_that_are_one_number_are_one(text, tmp_path):
     points = stream()
@@ -385,8 +393,8 @@ def test_units_that_may_be_several_are_asked_for(tmp_path):
 def test_what_is_in_memory_is_a_bucket_not_the_file(tmp_path, monkeypatch):
     read, sizes, imported = pl.read_parquet, [], []
 
-    def watched(files):
-        table = read(files)
+    def watched(files, **options):
+        table = read(files, **options)
         sizes.append(table.height)
         return table
 

@@ -2,9 +2,12 @@
 
 import dataclasses
 import gzip
+import io
 import json
 import os
+import shutil
 import tempfile
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -210,6 +213,21 @@ def test_tables_may_be_parquet_compressed_or_by_other_delimiters(tmp_path, expec
         np.testing.assert_array_equal(counts(imported), expected, name)
 
 
+@pytest.mark.parametrize("folder", ["data [2]", "~"])
+def test_paths_are_files_and_no_patterns(folder, tmp_path, monkeypatch, expected):
+    monkeypatch.chdir(tmp_path)
+    Path(folder).mkdir()
+    text = plain(Path(folder) / "p[1].csv", stream()).read_text("utf-8")
+    (Path(folder) / "blanks [1].txt").write_text(text.replace(",", " "), "utf-8")
+    pl.read_csv(io.StringIO(text)).write_parquet(tmp_path / folder / "p[1].parquet")
+    for path in ("p[1].csv", "blanks [1].txt", "p[1].parquet"):
+        np.testing.assert_array_equal(counts(run(Path(folder) / path)), expected)
+        shutil.rmtree(Path(folder) / "imported")
+    with pytest.raises(TrajectoryError, match=r"p\*\.csv: the file cannot be read: No such file"):
+        run(Path(folder) / "p*.csv")
+    run(highd(stream(), Path(folder)), Source("highd", groups=("lower",)))
+
+
 def test_a_column_is_that_of_its_own_spelling(tmp_path, expected):
     path = plain(tmp_path / "a.csv", stream(), S=0.0 * stream()[:, 2])
     fold = dataclasses.replace(PLAIN, columns={**PLAIN.columns, "x": "s "})
@@ -227,7 +245,9 @@ BAD = {
         ("t,id,s,v\n0,1,2,3\n1,1,here,3\n", "row 3: s must be a finite number, got 'here'"),
         ("t,id,s,v\n0,1,2,3\n\n1,1,,3\n", "row 4: s must be a finite number, got nothing"),
         ("t,id,x,v\n0,1,2,3\n", r"source\.columns\.x must be .*'s'; found \['t', 'id', 'x', 'v'\]"),
-        (b"t,id,s,v\n0,\xff,2,3\n", "utf-8"),
+        (b"t,id,s,v\n0,\xff,2,3\n", "must be text in UTF-8, got invalid utf-8 sequence"),
+        ("t,id,s,v\n0,1,2,3\n".encode("utf-16"), "must be text in UTF-8, got bytes of 0"),
+        ("t;id;s;v\n0;1;2,5;3\n", "row 2: s must be a finite number with a point, got '2,5'"),
         ("t,\rid,s,v\n0,1,2,3\n", "the file cannot be read: new-line character"),
         (f"t,id,s,v\n0,1,{LONG},3\n", "row 2: s must be"),
         (f"t,id,{LONG},v\n", "row 1: it must have 3 fields, got 4"),
