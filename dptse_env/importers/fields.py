@@ -67,8 +67,12 @@ SURE, SURER = 0.65, 0.15
 swapped: 0.75 to 0.9 and 0.0 to 0.55 were seen in measured and simulated traffic."""
 FEWEST_BLOCKS = 30
 """Blocks by which it is told."""
-MOST_MISSED = 20.0
-"""Vehicles that pass on both sides of a cell with nothing in it before it is told to be off."""
+MOST_MISSED, MOST_UNSEEN, NEAR = 20.0, 8.0, 0.2
+"""Vehicles that must have passed a cell with nothing in it before it is told to be off, the sum of
+those that must have been in it in each interval, lest they were between two looks at it by chance,
+and the length of road [km] on a side by which it is told, of one cell at least."""
+USUAL_SHARE = 0.5
+"""Share of the flow at other times that they must have where they are on one side alone."""
 LARGEST_NUMBER = 1e6
 """Largest number in a file, in its unit."""
 LONGEST_FIELD = 31 * 86_400
@@ -80,8 +84,9 @@ class FieldSource:
     """A field in text files with a row for each cell and a column for each interval.
 
     A missing value is ``nan``, or nothing between two delimiters. An empty cell needs no speed;
-    zeros in both files are missing values where they are in all cells of an interval, in all
-    intervals of a cell, or where vehicles must have passed: detectors were off.
+    zeros in both files are missing values where they are in all cells of an interval or in all
+    intervals of a cell, and so are densities of 0 where vehicles must have passed: detectors were
+    off.
 
     Attributes:
         density: File of densities.
@@ -125,9 +130,10 @@ class FieldSource:
             OSError: A file cannot be read.
 
         Warns:
-            UserWarning: Gaps were filled; the road is empty at times; vehicles are conserved only
-                if rows are intervals or cells in the other order; data are odd in the unit that is
-                given, or all speeds are low, which congestion may explain, or another unit.
+            UserWarning: Gaps were filled; the road is empty at times, or stands where vehicles must
+                have passed; vehicles are conserved only if rows are intervals or cells in the other
+                order; data are odd in the unit that is given, or all speeds are low, which
+                congestion may explain, or another unit.
         """
         number(float, self.cell, "cell", Interval(0.001, 10))
         number(float, self.interval, "interval", Interval(0.01, 3600))
@@ -140,7 +146,20 @@ class FieldSource:
         path, other = getattr(self, kind), self._table(kind)
         allowed = f"a table of {self.density}'s shape {density.shape}"
         require(other.shape == density.shape, str(path), allowed, other.shape)
-        off = self._off(density, other, density * other if kind == "speed" else other)
+        for words, line, same in (
+            ("row 1", density[0, 1:], other[0, 1:]), ("column 1", density[1:, 0], other[1:, 0]),
+        ):  # fmt: skip
+            steps = np.sign(np.diff(line))
+            if len(steps) > 1 and abs(steps.sum()) == len(steps) and (line == same).all():
+                first = ", ".join(f"{each:g}" for each in line[:3])
+                raise ValueError(
+                    f"{self.density}: {words} must be values, got a header or an index, {first}, "
+                    f"..., as in {path}: leave it out"
+                )
+        density, other = self._turned("density", density), self._turned(kind, other)
+        flow = density * other if kind == "speed" else other
+        off = self._off(density, other, flow)
+        stand = self._passed((other == 0.0) & (density > 0.0), density, flow, sides=2)
         empty = ((density == 0.0) & ~np.isnan(other) & ~off).all(axis=0)
         other = np.where(np.isnan(other) & (density == 0.0), 0.0, other)
         density[off] = other[off] = np.nan
@@ -148,7 +167,11 @@ class FieldSource:
             self._filled(*each, off) for each in (("density", density), (kind, other))
         )
         for columns, told in (
-            (off.any(axis=0), f"detectors were off: {off.sum()} zeros in both files are gaps"),
+            (off.any(axis=0), f"detectors were off: {off.sum()} zeros are gaps"),
+            (
+                stand.any(axis=0),
+                f"{path} is 0 where vehicles are and must have passed: is it right?",
+            ),
             (empty, "the road is empty, as all densities are 0"),
         ):
             if columns.any():
@@ -235,13 +258,43 @@ class FieldSource:
         """Return where detectors were off, shape (cells, intervals): zeros that cannot be."""
         zero = (density == 0.0) & (other == 0.0)
         off: BoolArray = zero & (zero.all(axis=0) | zero.all(axis=1, keepdims=True))
-        for cell in np.flatnonzero((zero & ~off).any(axis=1)):
-            sides = [side for side in (flow[:cell], flow[cell + 1 :]) if len(side)]
-            passing = np.min([np.nan_to_num(side).mean(axis=0) for side in sides], axis=0)
-            for start, stop in _runs(zero[cell] & ~off[cell]):
-                if passing[start:stop].sum() * self.interval / 3600.0 > MOST_MISSED:
-                    off[cell, start:stop] = True
-        return off
+        return off | self._passed((density == 0.0) & ~np.isnan(other) & ~off, density, flow)
+
+    def _passed(
+        self, still: BoolArray, density: FloatArray, flow: FloatArray, sides: int = 1
+    ) -> BoolArray:
+        """Return which runs of `still`, shape (cells, intervals), vehicles must have passed.
+
+        They passed cells upstream or downstream, those with traffic at that time, and were not held
+        between: more did than the vehicles there changed by, on both sides. Where one side has no
+        such cell, and `sides` is 1, the other must have its usual flow, and not that of a ramp.
+        """
+        found = np.zeros_like(still)
+        density, flow = np.nan_to_num(density), np.nan_to_num(flow) * self.interval / 3600.0
+        moving = (density > 0.0) & (flow > 0.0)
+        at_most = np.append(0.0, flow.max(axis=0).cumsum())
+        for cell in np.flatnonzero(still.any(axis=1)):
+            moves = ~still[cell]
+            for start, stop in _runs(still[cell]):
+                if at_most[stop] - at_most[start] <= MOST_MISSED:
+                    continue
+                missed, usual = [], True
+                for side in (np.arange(cell)[::-1], np.arange(cell + 1, len(flow))):
+                    near = side[moving[side, start:stop].any(axis=1)]
+                    near = near[self.cell * abs(near - near[:1]) < NEAR]
+                    if not len(near):
+                        continue
+                    past, there = flow[near, start:stop], self.cell * density[near]
+                    held = np.ptp(there[:, max(start - 1, 0) : stop + 1].cumsum(axis=0), axis=1)
+                    seen = there[:, start:stop].sum(axis=1).mean()
+                    missed.append(
+                        (past.sum(axis=1) - held).mean() > MOST_MISSED and seen > MOST_UNSEEN
+                    )
+                    at_other_times = flow[near].sum(where=moves) / max(moves.sum(), 1)
+                    usual = past.sum() / (stop - start) > USUAL_SHARE * at_other_times
+                told = len(missed) >= sides and all(missed)
+                found[cell, start:stop] = told and (usual or len(missed) == 2)
+        return found
 
     def _filled(self, kind: str, table: FloatArray, off: BoolArray) -> FloatArray:
         """Return a table (cells, intervals) whose gaps in time are filled, or refuse long ones."""
@@ -284,8 +337,7 @@ class FieldSource:
 
     def _table(self, kind: str) -> FloatArray:
         path, unit = getattr(self, kind), getattr(self, f"{kind}_unit")
-        unit = USUAL[kind] if unit is None else unit
-        require_name(f"{kind}_unit", unit, UNITS[kind])
+        require_name(f"{kind}_unit", USUAL[kind] if unit is None else unit, UNITS[kind])
         if path.is_dir():
             raise ValueError(f"{path} must be a file, got a directory")
         try:
@@ -298,33 +350,22 @@ class FieldSource:
             allowed = f"a table of numbers, with {by} between them, without header and names"
             raise ValueError(f"{path} must be {allowed}: {cut(problem)}") from problem
         require(table.size > 0, str(path), "a table of at least one number", table.shape)
-        body = table[1:, 1:]
-        for words, line, rest in (
-            ("row 1", table[0, 1:], body), ("column 1", table[1:, 0], body.T),
-        ):  # fmt: skip
-            if body.size and _is_count(line) and not any(map(_is_count, rest)):
-                first = ", ".join(f"{each:g}" for each in line[:3])
-                raise ValueError(
-                    f"{path}: {words} must be values, got a header or an index, {first}, ...: "
-                    "leave it out"
-                )
         for row, column in np.argwhere((table < 0.0) | (table > LARGEST_NUMBER))[:1]:
             raise ValueError(
                 f"{path}: row {row + 1}, column {column + 1} must be in [0, {LARGEST_NUMBER:g}], "
                 f"or nan where it is missing, got {table[row, column]}"
             )
+        return table
+
+    def _turned(self, kind: str, table: FloatArray) -> FloatArray:
+        """Return a table in the usual unit, of shape (cells, intervals), from upstream on."""
+        unit = getattr(self, f"{kind}_unit") or USUAL[kind]
         table = UNITS[kind][unit] * (table.T if self.transposed else table)
         return table[::-1] if self.reversed else table
 
 
 def _number_or_nan(text: str) -> float:
     return float(text) if text.strip() else np.nan
-
-
-def _is_count(line: FloatArray) -> bool:
-    """Return whether numbers are those of a header or an index: equal steps, not values."""
-    steps = np.diff(line)
-    return len(steps) > 1 and steps[0] != 0.0 and np.allclose(steps, steps[0])
 
 
 def _runs(where: BoolArray) -> list[list[int]]:

@@ -366,9 +366,7 @@ class Recording:
         """Write the seconds of a bucket that are in windows; return the pieces of trajectories."""
         c = pl.col
         files = self.folder / "points" / f"bucket={bucket}"
-        points = (
-            pl.read_parquet(files, glob=False) if files.is_dir() else self._points.head(0).collect()
-        )
+        points = pl.read_parquet(files) if files.is_dir() else self._points.head(0).collect()
         points = points.filter(c("vehicle").is_not_null(), c("group").is_in(list(coverage)))
         time = ((c("time") + self.shift - self.base) / TIME_UNIT).round() * TIME_UNIT
         near = (c("time") - c("time").round()).abs() < 0.1 * TIME_UNIT

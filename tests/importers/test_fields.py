@@ -271,6 +271,29 @@ def test_zeros_while_detectors_were_off_are_gaps(tmp_path):
         save(tmp_path, density=density, speed=speed).read(3, 100.0)
 
 
+@pytest.mark.parametrize("kind", ["speed", "flow"])
+@pytest.mark.parametrize(
+    "cells", [slice(3), slice(-3, None), slice(6, 12), slice(1, 12, 2), slice(1, 12)]
+)
+def test_detectors_that_are_off_beside_others_are_gaps(cells, kind, tmp_path):
+    density, speed = traffic()
+    tables = {"density": density, kind: speed if kind == "speed" else density * speed}
+    for zero in ("density", kind):  # density alone at first: the other one contradicts it
+        tables["density"][cells, 20:32] = tables[zero][cells, 20:32] = 0.0  # 60 s
+        told = f"detectors were off: {density[cells, 20:32].size} zeros"
+        with pytest.warns(UserWarning, match=rf"in column\(s\) 21\.\.32, {told}"):
+            found, flow = save(tmp_path, **tables).read(3, 100.0)
+        assert found.min() > 50.0
+        assert flow.min() > 500.0
+
+
+def test_a_flow_of_zero_beside_vehicles_is_told_where_others_pass(tmp_path):
+    density, speed = traffic()
+    speed[4, 30:42] = 0.0
+    with pytest.warns(UserWarning, match=r"column\(s\) 31\.\.42, .*speed\.txt is 0 where vehicles"):
+        save(tmp_path, density=density, speed=speed).read(3, 100.0)
+
+
 @pytest.mark.parametrize(
     ("empty", "told"), [(np.nan, []), (100.0, [r"in column(s) 1..15, 21..50, the road is empty"])]
 )
@@ -291,18 +314,20 @@ def test_a_road_may_be_empty_for_minutes(empty, told, tmp_path):
     ("rows", "columns", "got"),
     [
         (True, False, r"row 1 must be values, got a header or an index, 1, 2, 3"),
-        (False, True, r"column 1 must be values, got a header or an index, 0\.1, 0\.2, 0\.3"),
+        (False, True, r"column 1 must be values, got a header or an index, 12\.01, 12\.04, 12\.09"),
         (True, True, r"row 1 must be values"),
     ],
 )
 def test_headers_and_index_columns_are_named(rows, columns, got, tmp_path):
     tables = {}
     for name, values in zip(("density", "speed"), traffic(), strict=True):
-        header, index = np.arange(60.0), 0.1 * np.arange(12.0)[:, None]
+        header, index = np.arange(60.0), 12.0 + 0.01 * np.arange(12.0)[:, None] ** 2
         table = np.hstack([index, values]) if columns else values
         header = np.concatenate([[np.nan], header]) if columns else header
         tables[name] = np.vstack([header, table]) if rows else table
-    with pytest.raises(ValueError, match=rf"density\.txt: {got}, \.\.\.: leave it out|{got}"):
+    with pytest.raises(
+        ValueError, match=rf"density\.txt: {got}.*, \.\.\., as in .*speed\.txt: leave it out"
+    ):
         save(tmp_path, ",", **tables).read(3, 100.0)
 
 

@@ -393,8 +393,8 @@ def test_units_that_may_be_several_are_asked_for(tmp_path):
 def test_what_is_in_memory_is_a_bucket_not_the_file(tmp_path, monkeypatch):
     read, sizes, imported = pl.read_parquet, [], []
 
-    def watched(files, **options):
-        table = read(files, **options)
+    def watched(files):
+        table = read(files)
         sizes.append(table.height)
         return table
 
