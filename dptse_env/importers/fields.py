@@ -188,6 +188,7 @@ class FieldSource:
         speed = (other if kind == "speed" else other / np.maximum(density, LEAST_DENSITY))[occupied]
         light = speed[density[occupied] < LIGHT * lanes]
         self._check_unit(kind, lambda f: _odd_speed(f * speed, f * light, speed_limit))
+        self._check_values(density, other, lanes)
         flow = density * other if kind == "speed" else other
         most = BUSIEST * lanes
         if (flow > most).mean() > FEW:
@@ -253,6 +254,32 @@ class FieldSource:
             f"{' or '.join(likely) or 'none that is known'}, got {USUAL[kind]!r}: {problem}; a "
             "unit that is given is kept"
         )
+
+    def _check_values(self, density: FloatArray, other: FloatArray, lanes: int) -> None:
+        """Refuse a few values that no road can have, and tell of a number that may be a sign.
+
+        Tables are of shape (cells, intervals). A speed where nobody is counts for nothing.
+        """
+        fastest = self.speed, 2.0 * FASTEST, "km/h", other * (density > 0.0)
+        busiest = self.flow, 2.0 * lanes * max(BUSIEST, 3600.0 / self.interval), "veh/h", other
+        fullest = self.density, 2.0 * lanes * max(FULL, 1.0 / self.cell), "veh/km", density
+        names = ("column", "row") if self.transposed else ("row", "column")
+        for path, most, unit, table in (fullest, fastest if self.speed else busiest):
+            beyond = table > most
+            if 0.0 < beyond.mean() <= FEW:
+                cell, interval = np.argwhere(beyond)[0]
+                row = len(table) - 1 - cell if self.reversed else cell
+                raise ValueError(
+                    f"{path}: {names[0]} {row + 1}, {names[1]} {interval + 1} must be at most "
+                    f"{most:g} {unit}, or nan where it is missing, got {table[cell, interval]:.6g}"
+                )
+            values, counts = np.unique(table, return_counts=True)
+            if len(values) > 2 and counts[-1] > 2 and values[-1] > 2.0 * values[-2]:
+                warnings.warn(
+                    f"{path}: {counts[-1]} values are {values[-1]:.6g} {unit}, and no other is "
+                    f"above {values[-2]:.6g}: let them be nan if they are missing",
+                    stacklevel=4,
+                )
 
     def _off(self, density: FloatArray, other: FloatArray, flow: FloatArray) -> BoolArray:
         """Return where detectors were off, shape (cells, intervals): zeros that cannot be."""

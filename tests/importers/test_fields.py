@@ -294,6 +294,34 @@ def test_a_flow_of_zero_beside_vehicles_is_told_where_others_pass(tmp_path):
         save(tmp_path, density=density, speed=speed).read(3, 100.0)
 
 
+def test_a_ramp_may_feed_a_road_that_is_empty_upstream(tmp_path):
+    density, speed = traffic()
+    density[:4, 20:50] = speed[:4, 20:50] = 0.0
+    density[4:, 20:50], speed[4:, 20:50] = 15.0, 60.0  # 37 vehicles
+    found = save(tmp_path, density=density, speed=speed).read(3, 100.0)[0]
+    np.testing.assert_allclose(found, density, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("kind", "number"), [("density", 9999), ("speed", 999), ("flow", 65535)])
+def test_numbers_that_no_road_can_have_are_refused(kind, number, tmp_path):
+    density, speed = traffic()
+    tables = {"density": density, "speed": speed}
+    if kind == "flow":
+        tables = {"density": density, "flow": density * speed}
+    tables[kind][3, 7] = number
+    message = rf"{kind}\.txt: row 4, column 8 must be at most .*, or nan .*, got {number}$"
+    with pytest.raises(ValueError, match=message):
+        save(tmp_path, **tables).read(3, 100.0)
+
+
+def test_a_number_far_above_others_that_comes_again_is_told(tmp_path):
+    density, speed = traffic()
+    speed[3:6, 7] = 255.0
+    message = r"speed\.txt: 3 values are 255 km/h, and no other is above [\d.]+: let them be nan if"
+    with pytest.warns(UserWarning, match=message):
+        save(tmp_path, density=density, speed=speed).read(3, 100.0)
+
+
 @pytest.mark.parametrize(
     ("empty", "told"), [(np.nan, []), (100.0, [r"in column(s) 1..15, 21..50, the road is empty"])]
 )
