@@ -21,7 +21,9 @@ from dptse_env.importers.resampling import (
     TIME_UNIT,
     check_pieces,
     count_ends,
+    earlier,
     steps_back,
+    steps_together,
     stretches,
     whole_seconds,
 )
@@ -117,6 +119,7 @@ class Recording:
         self.shift = self._time_shift(seconds)
         coverage = self._cut(seconds)
         self._stretches: list[pl.DataFrame] = []
+        self._earlier: list[pl.DataFrame] = []
         pieces = pl.concat([self._take(bucket, coverage) for bucket in range(n_buckets)])
         self._require_one_clock()
         self._require_joined()
@@ -267,9 +270,15 @@ class Recording:
         return float(times[1] - times[0])
 
     def _require_one_clock(self) -> None:
-        """Refuse a file that is sorted by time and whose time steps back over other vehicles."""
-        steps, overlap = steps_back(pl.concat(self._stretches))
+        """Refuse a file whose time steps back over other vehicles."""
+        found, drives_on = pl.concat(self._stretches), pl.concat(self._earlier)
+        steps, overlap = steps_back(found)
         self.counts["steps_back"] = len(steps)
+        if not overlap:
+            steps = steps_together(drives_on, self.options.longest_gap)
+            # Else the recording that is first in time comes last in the file.
+            first = found.select(pl.col("begin").min()).item()
+            overlap = bool(steps) and steps[0][2] > first + self.options.longest_gap
         if overlap:
             row, *times = steps[0]
             before, at = (f"{time + self.base - self.shift:.10g} s" for time in times)
@@ -385,6 +394,7 @@ class Recording:
         labels = points.group_by("id").agg(name=whole)
         points = points.drop("off", "bad")
         self._stretches.append(stretches(points, self.options.longest_gap))
+        self._earlier.append(earlier(points, self.options.longest_gap))
         found, pieces = whole_seconds(
             points, self.road, self.options.longest_gap, self.counts, str(self.path)
         )

@@ -32,7 +32,8 @@ _COUNTS = {
     },
     "trajectories": {
         "vehicles": "vehicles by id",
-        "ids_shared": "ids of several vehicles at one time, told apart by their positions",
+        "ids_shared": "ids of several vehicles at one time, told apart by their positions; if they "
+        "are many, does the file have two recordings, or traffic of two times?",
         "pieces": "trajectories after cuts; each counts as a vehicle",
         "gaps_filled": "gaps filled by interpolation",
         "seconds_filled": "whole seconds in them",

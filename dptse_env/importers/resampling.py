@@ -23,6 +23,8 @@ JUMP = 0.05
 """Distance that noise may add, forwards or backwards [km]."""
 SAME_PLACE = 0.005
 """Largest distance between two points that count as duplicates [km]."""
+FEWEST_TOGETHER = 3
+"""Vehicles that drive on at an earlier time, together, if a clock was set back."""
 MOST_SHARING = 20
 """Vehicles that may share an id at one time."""
 HALF_WIDTH = 0.5
@@ -224,6 +226,32 @@ def stretches(points: pl.DataFrame, longest_gap: float) -> pl.DataFrame:
         .drop("stretch")
     )  # fmt: skip
     return found if 2 * len(found) <= len(kept) else found.clear()
+
+
+def earlier(points: pl.DataFrame, longest_gap: float) -> pl.DataFrame:
+    """Return points (row, id, before [s], at [s]) at which a vehicle drives on, but earlier.
+
+    Args:
+        points: Points of some vehicles, as for `whole_seconds`, in the order of the file.
+        longest_gap: Longest time between two points of a stretch [s].
+    """
+    c = pl.col
+    wait, move = (c(name).diff().over("id") for name in ("time", "position"))
+    drives_on = (move > 0.0) & (move <= JUMP) & (wait < -longest_gap)
+    found = points.select("row", "id", before=c("time") - wait, at="time", on=drives_on)
+    return found.filter("on").drop("on")
+
+
+def steps_together(found: pl.DataFrame, within: float) -> list[tuple[int, float, float]]:
+    """Return where vehicles drive on, but earlier, most of them at one time [s], as `steps_back`.
+
+    So they do in a file that is sorted by vehicle and whose clock was set back.
+    """
+    c = pl.col
+    same = [(c(name) - c(name).median()).abs() <= within for name in ("before", "at")]
+    together = found.sort("row").filter(*same)
+    many = together["id"].n_unique() >= FEWEST_TOGETHER and 2 * len(together) > len(found)
+    return together.select("row", "before", "at").rows() if many else []
 
 
 def steps_back(found: pl.DataFrame) -> tuple[list[tuple[int, float, float]], bool]:

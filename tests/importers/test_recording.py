@@ -123,6 +123,17 @@ def test_a_time_that_steps_back_into_traffic_is_refused(back, again, keep, ids, 
         run(plain(tmp_path / "a.csv", points))
 
 
+@pytest.mark.parametrize("block", [1, 20])
+def test_a_clock_that_is_set_back_is_told_in_a_file_by_vehicle(block, tmp_path):
+    points = stream(seconds=200.0)
+    points[points[:, 1] > 130.0, 1] -= 60.0
+    blocks = np.arange(len(points)) // block
+    points = points[np.lexsort((np.random.default_rng(0).random(len(points)), blocks))]
+    message = r"a\.csv, row \d+: the time must not step back into .*, got 7[\d.]+ s after 1[23]\d"
+    with pytest.raises(TrajectoryError, match=message):
+        run(plain(tmp_path / "a.csv", points))
+
+
 @pytest.mark.parametrize(
     "order",
     [
@@ -133,8 +144,18 @@ def test_a_time_that_steps_back_into_traffic_is_refused(back, again, keep, ids, 
         halves,
         lambda points: np.concatenate([by_time(points), by_time(points)]),
         lambda points: np.concatenate([points[300:650], points[:300], points[650:]]),
+        lambda points: np.concatenate([points[points[:, 1] >= 60], points[points[:, 1] < 60]]),
     ],
-    ids=["time", "back", "none", "within a frame", "halves", "twice", "pages of vehicles"],
+    ids=[
+        "time",
+        "back",
+        "none",
+        "within a frame",
+        "halves",
+        "twice",
+        "pages of vehicles",
+        "halves by vehicle",
+    ],
 )
 def test_rows_may_be_in_any_order_of_one_traffic(order, tmp_path):
     points = stream()
@@ -290,7 +311,7 @@ def test_vehicles_that_share_an_id_at_one_time_are_told_apart(shuffled, tmp_path
     for vehicle in np.unique(record.vehicle):
         assert (np.diff(record.segment[record.vehicle == vehicle][:-1]) >= 0).all()
     text = (tmp_path / "shared" / "imported" / "report.md").read_text("utf-8")
-    assert "| 4 | ids of several vehicles at one time, told apart by their positions |" in text
+    assert "| 4 | ids of several vehicles at one time, told apart by their positions; " in text
 
 
 def test_vehicles_that_share_an_id_may_have_times_that_alternate(tmp_path):
