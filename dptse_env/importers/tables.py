@@ -222,14 +222,14 @@ def _text(path: Path, form: Format) -> _Raw:
         "infer_schema": False, "has_header": has_header, "row_index_name": ROW,
         "row_index_offset": 1 + has_header, "glob": False,
     }  # fmt: skip
-    file = path.absolute()  # since polars expands ~
+    absolute = path.absolute()  # since polars expands ~
     if not blanks:
-        raw = pl.scan_csv(file, separator=separator, new_columns=names, **options)
+        raw = pl.scan_csv(absolute, separator=separator, new_columns=names, **options)
         # "1,118,846,663,000": portals export numbers with their digits in groups.
         grouped = separator == "," and re.search(r'"\d{1,3}(,\d{3})+(\.\d*)?"', text) is not None
         return _Raw(raw, rows, grouped)
     # Runs of blanks: a line is one column first.
-    raw = pl.scan_csv(file, separator="\x01", quote_char=None, new_columns=["line"], **options)
+    raw = pl.scan_csv(absolute, separator="\x01", quote_char=None, new_columns=["line"], **options)
     fields = pl.col("line").str.extract_all(r"\S+")
     columns = (fields.list.get(i, null_on_oob=True).alias(name) for i, name in enumerate(names))
     return _Raw(raw.select(ROW, *columns), rows)
