@@ -28,7 +28,7 @@ from agents.files import write_json
 from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
-from dptse_env.privacy import epsilon_of, mu_of
+from dptse_env.privacy import epsilon_of, mu_of, rounded_up
 from dptse_env.release import PrivacyReport
 from dptse_env.traffic import Record
 from dptse_env.utils.fields import require
@@ -97,7 +97,7 @@ class Finding:
             rows.append((f"epsilon at delta {claim.delta:g}", claim.epsilon, result.epsilon))
         for name, claimed, bound in rows:
             rates = f"<= {bound.false_positives:.4f}", f"<= {bound.false_negatives:.4f}"
-            row = f"{claimed:.3f}", f"{bound.value:.3f}", f"{bound.threshold:.2f}", *rates
+            row = rounded_up(claimed, ".3f"), f"{bound.value:.3f}", f"{bound.threshold:.2f}", *rates
             table.add_row(name, *row)
         print_table(table)
         trials = f"at most, in {result.n} runs per world"
