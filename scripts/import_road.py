@@ -31,7 +31,6 @@ from dptse_env.importers.network import (
 )
 from dptse_env.importers.report import REPORT, remarks
 from dptse_env.traffic import Corridor, is_road_file, ranges, read_road, write_corridor
-from dptse_env.utils.fields import require
 from dptse_env.utils.files import replacing, require_output
 from scripts.cli import Environment
 
@@ -79,8 +78,6 @@ class Trajectories(Environment):
 
     def run(self) -> None:
         """Import, and print which traffic seeds there are and what to do next."""
-        once = len({path.resolve() for path in self.files}) == len(self.files)
-        require(once, "files", "given once each", [str(path) for path in self.files])
         env, keywords = parse_env(self.env)
         road = keywords.get("corridor")
         environment = read_road(road).environment if is_road_file(road) else {}

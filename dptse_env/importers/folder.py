@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
-import glob
 import itertools
 import os
 import shutil
@@ -28,7 +27,7 @@ from dptse_env.traffic.imported import Kind, load_record, ranges, save_record, w
 from dptse_env.traffic.record import Record, average_dwell
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.fields import require, require_name
-from dptse_env.utils.files import hidden, require_output
+from dptse_env.utils.files import hidden, left_hidden, require_output
 
 ROAD = "road.toml"
 NO_SPACE = 2**16
@@ -100,6 +99,8 @@ def import_trajectories(
     """
     require_name("source.format", source.format, FORMATS)
     require(len(files) > 0, "files", "one or more", len(files))
+    once = len({path.resolve() for path in files}) == len(files)
+    require(once, "files", "given once each", [str(path) for path in files])
     check_splits(splits)
     bare = dataclasses.replace(
         corridor, incident=None, recordings=None, demand=corridor.published_demand
@@ -140,7 +141,7 @@ def import_trajectories(
         ]
         if empty:
             notes.append(f"windows begin on an empty mainline: traffic seeds {ranges(empty)}")
-        notes += overlaps(sources, corridor.duration)
+        notes += _overlaps(sources, corridor.duration)
 
         def load(seed: int) -> Record:
             return load_record(kept, seed, bare.record_layout)
@@ -187,7 +188,7 @@ def moved(road: Corridor, output: Path) -> Corridor:
     return dataclasses.replace(road, recordings=there)
 
 
-def overlaps(windows: Iterable[Mapping[str, Any]], duration: float) -> list[str]:
+def _overlaps(windows: Iterable[Mapping[str, Any]], duration: float) -> list[str]:
     """Return a note on the first windows [s] of two files that are at one time, by their dates."""
     in_order = sorted(windows, key=lambda each: (each["group"], each["start"]))
     for one, other in itertools.pairwise(in_order):
@@ -287,7 +288,7 @@ def new_folder(output: Path) -> Iterator[Path]:
     require_output(output.parent, [output.name])
     output.parent.mkdir(parents=True, exist_ok=True)
     work = hidden(output.absolute())
-    for left in output.parent.glob(f".{glob.escape(output.name)}-{'[0-9a-f]' * 32}"):
+    for left in left_hidden(output):
         shutil.rmtree(left, ignore_errors=True)
     folder = work / "result"
     folder.mkdir(parents=True)

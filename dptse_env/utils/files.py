@@ -6,6 +6,7 @@ they are in memory. Their card, what one should know of the arrays, stands in th
 """
 
 import contextlib
+import glob
 import hashlib
 import json
 import os
@@ -274,6 +275,11 @@ def _depth(node: Any) -> int:
 def hidden(path: Path) -> Path:
     """Return where something is made that takes the place of `path` when it is complete."""
     return path.with_name(f".{path.name}-{uuid.uuid4().hex}")
+
+
+def left_hidden(path: Path) -> Iterator[Path]:
+    """Yield what processes that were killed have left, or others still use, of `hidden`."""
+    return path.parent.glob(f".{glob.escape(path.name)}-{'[0-9a-f]' * 32}")
 
 
 @contextlib.contextmanager
