@@ -1,4 +1,4 @@
-"""What played: the version of this code with a digest of what moves its numbers."""
+"""The version of this code, with a digest of what moves its numbers: rows and cards name it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-from dptse_env.command_line import TOOLS
 
 __version__ = "0.3.0.dev0"
 
@@ -48,6 +45,8 @@ def versions_with(*packages: str) -> dict[str, str]:
     Raises:
         PackageNotFoundError: One is not installed.
     """
+    from importlib.metadata import version  # noqa: PLC0415 (slow to import)
+
     return {"dptse-env": code_version(), **{name: version(name) for name in packages}}
 
 
@@ -82,6 +81,8 @@ def equal_digests() -> Mapping[str, str]:
 @cache
 def digest() -> str:
     """Return 12 digits of the digest of this code, the same in a wheel and in a checkout."""
+    from dptse_env.command_line import TOOLS  # noqa: PLC0415 (slow to import)
+
     return digest_of(PACKAGE, TOOLS if TOOLS.is_dir() else PACKAGE.parent)
 
 
