@@ -15,9 +15,9 @@ import pytest
 import tyro
 
 from scripts.dptse import MODULES
-from tests.helpers import fast_and_slow
+from tests.helpers import ROOT, fast_and_slow
 
-from .blocks import BLOCKS, PAGES, ROOT, commands
+from .blocks import BLOCKS, PAGES, commands
 from .test_guides import GUIDES
 
 RUN_ELSEWHERE = {"README.md", "tutorial.md", "your-own-part.md", *GUIDES}

@@ -8,8 +8,7 @@ import pytest
 from scipy.special import ndtr
 
 from dptse_env.privacy import DELTAS, epsilon_of, mu_of, over_trips, rounded_up
-
-from .blocks import ROOT
+from tests.helpers import ROOT
 
 GUARANTEE, PROOF = (
     (ROOT / "docs" / "privacy" / name).read_text(encoding="utf-8")

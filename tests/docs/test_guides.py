@@ -17,9 +17,10 @@ import pytest
 
 from dptse_env.policies import read_policy
 from dptse_env.traffic import read_corridor
+from tests.helpers import ROOT
 from tests.scripts.commands import run_command
 
-from .blocks import ROOT, blocks_of, commands
+from .blocks import blocks_of, commands
 
 FIT = "--tries 1 --estimators ekf --rules round-robin --workers 1"
 SEEDS = "--training 0:2 --validation 1000:1002 --test 2000:2002"

@@ -5,7 +5,7 @@ import runpy
 
 import pytest
 
-from .blocks import ROOT
+from tests.helpers import ROOT
 
 PAGES = {
     page.stem: page.read_text(encoding="utf-8")

@@ -7,9 +7,10 @@ import shlex
 
 import pytest
 
+from tests.helpers import ROOT
 from tests.scripts.commands import run_command
 
-from .blocks import ROOT, blocks_of, commands
+from .blocks import blocks_of, commands
 
 BLOCKS = blocks_of(ROOT / "README.md")
 

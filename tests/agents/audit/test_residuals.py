@@ -11,8 +11,7 @@ from dptse_env.parts import make_task
 from dptse_env.release import Capped, Paced, Paper
 from dptse_env.release.noise import Noise
 from dptse_env.traffic import RecordLibrary
-from tests.docs.blocks import ROOT
-from tests.helpers import SHORT
+from tests.helpers import ROOT, SHORT
 
 from .mechanisms import MECHANISMS, noisy
 from .small import HORIZON, config

@@ -31,6 +31,7 @@ from dptse_env.traffic.own_sumo import TRAFFIC, copy_input
 from dptse_env.traffic.sumo import running, seconds
 from dptse_env.traffic.sumo_input import packaged_network
 from dptse_env.utils.files import file_digest
+from tests.helpers import ROOT
 from tests.importers.network.conftest import FLOWS, PATH
 
 
@@ -204,7 +205,7 @@ def test_letters_beyond_ascii_in_folders_are_of_no_matter(locale, files, tmp_pat
     places = dict.fromkeys(("TMPDIR", "HOME", "TEMP", "TMP"), str(folder))
     done = subprocess.run(
         [sys.executable, "-c", LOCAL, *PATH],
-        env=os.environ | places | {"LC_ALL": locale, "PYTHONPATH": str(Path.cwd())},
+        env=os.environ | places | {"LC_ALL": locale, "PYTHONPATH": str(ROOT)},
         cwd=folder, capture_output=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr.decode()
