@@ -37,7 +37,7 @@ AXES, QUANTITIES = ("second", "column", "quantity"), ("density", "speed")
 
 @dataclass(frozen=True)
 class NoiseTest:
-    """How well residuals agree with independent noise that is no smaller than stated.
+    """Agreement of residuals with independent noise that is no smaller than stated.
 
     Attributes:
         n: Number of residuals.

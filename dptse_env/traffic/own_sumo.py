@@ -376,7 +376,7 @@ class VehicleLimits:
 
 @dataclass
 class Copied:
-    """What a copy for SUMO differs in from its file.
+    """Differences of a copy for SUMO from its file.
 
     Attributes:
         n_elements: number of elements at the top.

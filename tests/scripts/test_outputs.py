@@ -1,4 +1,4 @@
-"""Where results go is looked at before any work, by every command that writes some."""
+"""Every command that writes results checks their place before any work."""
 
 import errno
 import re

@@ -118,7 +118,7 @@ def test_a_kernel_is_kept_on_disk_and_compiled_anew_when_a_part_changes(fresh):
 
 
 class Harm:
-    """What fails the test when it is unpickled."""
+    """An object that fails the test when it is unpickled."""
 
     def __reduce__(self):
         return pytest.fail, ("it was unpickled",)
