@@ -329,8 +329,7 @@ MUTANTS = (
     ),
     Mutant(
         "flows are not centred on the middle of the speeds", 12, "release/gaussian.py",
-        "return 0.5 * corridor.largest_speed_limit if",
-        "return 0.4 * corridor.largest_speed_limit if",
+        "return 0.5 * corridor.largest_speed_limit", "return 0.4 * corridor.largest_speed_limit",
         "test_guarantee.py",
     ),
     Mutant(

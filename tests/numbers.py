@@ -69,7 +69,6 @@ RELEASES: dict[str, dict[str, Any]] = {
     "corrected": {"privacy": "corrected"},
     "capped": {"privacy": "capped"},
     "capped-event": {"privacy": {"preset": "capped", "unit": "event"}},
-    "capped-mean": {"privacy": {"preset": "capped", "speed_release": "mean", "cap": 9}},
     "capped-boundary": {"privacy": {"preset": "capped", "boundary_inputs": "private"}},
     "paced": {"privacy": "paced"},
     "paced-spans": {"privacy": "paced", "query_spans": [1, 2], "price_levels": [0.5, 1.0]},

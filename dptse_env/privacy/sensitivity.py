@@ -112,7 +112,6 @@ def contribution_sensitivity(
     adjacency: Adjacency,
     segment_length: float,
     largest_speed: float,
-    mean_speed_slope: float | None = None,
 ) -> Sensitivity:
     """Sensitivities of density and centred flow for vehicles with bounded contributions.
 
@@ -130,8 +129,6 @@ def contribution_sensitivity(
         adjacency: difference of adjacent records.
         segment_length: l [km].
         largest_speed: v_max [km/h], a public constant that recorded speeds are clipped to.
-        mean_speed_slope: the paper's relation Delta_v / Delta_rho [km/h per veh/km], which does
-            not hold, where mean speeds are released in place of flows; else None.
 
     Raises:
         ValueError: A number is out of range.
@@ -144,18 +141,16 @@ def contribution_sensitivity(
     if adjacency == "replace":
         same_segment = 2.0 * flow
         density, flow = math.sqrt(2.0) * density, math.sqrt(2.0) * flow
-    extremes: tuple[tuple[float, ...], ...] = ((density, flow), (0.0, same_segment))
-    second = ReleaseSensitivity("flow", "veh/h", max(flow, same_segment))
-    if mean_speed_slope is not None:
-        second = ReleaseSensitivity("speed", "km/h", mean_speed_slope * density)
-        extremes = ()
     return Sensitivity(
-        releases=(ReleaseSensitivity("density", "veh/km", density), second),
+        releases=(
+            ReleaseSensitivity("density", "veh/km", density),
+            ReleaseSensitivity("flow", "veh/h", max(flow, same_segment)),
+        ),
         assumptions=(
             ("contributions", contributions),
             ("segment_length_km", segment_length),
             ("largest_speed_km_h", largest_speed),
         ),
-        extremes=extremes,
+        extremes=((density, flow), (0.0, same_segment)),
         contributions=contributions,
     )

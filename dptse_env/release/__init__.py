@@ -17,7 +17,6 @@ from dptse_env.release.gaussian import (
     Corrected,
     GaussianRelease,
     Paper,
-    SpeedRelease,
     require_gaussian,
 )
 from dptse_env.release.paced import Paced, PacedSettings
@@ -69,7 +68,6 @@ __all__ = [
     "QueryOptions",
     "ReleaseModel",
     "Request",
-    "SpeedRelease",
     "Task",
     "Traffic",
     "check_released",

@@ -43,9 +43,6 @@ from dptse_env.utils.vector_info import Rows, object_array
 Unit = Literal["trip", "horizon", "event"]
 """Unit of protection: a trip with capped contributions, a complete trip, or a second of it."""
 
-SpeedRelease = Literal["mean", "flow"]
-"""Release of speeds: as their mean over a segment's vehicles, or as a sum, the centred flow."""
-
 
 class GaussianRelease(ReleaseModel):
     """Release of true values plus Gaussian noise; subclasses define values and sensitivity.
@@ -89,7 +86,7 @@ class GaussianRelease(ReleaseModel):
         self._released_sigma = self.added_std / self.unit[:, None]
         v_0 = math.nan if task.flow_centre is None else task.flow_centre
         self._centre = np.full((n, task.n_places), v_0)
-        self._price, self._zero = np.ones((n, task.n_columns)), np.zeros((n, task.n_places))
+        self._price = np.ones((n, task.n_columns))
         self.noise = Noise(n, task.n_columns, task.settings.noise)
         self.ledgers = self._ledgers()
         if task.releases_flow:
@@ -144,19 +141,6 @@ class GaussianRelease(ReleaseModel):
         k = len(values)
         values = self.noise.added(request.episodes, values, self.added_std[:k], self.unit)
         return Measurement(request.observed, values, self._released_sigma[:k], self._centre[:k])
-
-    def mean_values(self, request: Request) -> FloatArray:
-        """Return `true_values` of densities and mean speeds of the vehicles that count.
-
-        Without any of them the speed limit is the mean; unobserved columns hold these, too.
-        """
-        task = self.task
-        sums = self.sums(request, self._zero)
-        counts = sums[..., 0].copy()
-        sums[..., 0] /= task.length
-        sums[..., 1] = np.where(counts == 0.0, task.limit, sums[..., 1] / np.maximum(counts, 1.0))
-        sums *= self.unit[:, None]
-        return sums
 
     def sums(self, request: Request, centre: FloatArray) -> FloatArray:
         """Return the sums of the vehicles that count, and of their speeds from a centre."""
@@ -233,6 +217,7 @@ class Paper(GaussianRelease):
         super().__init__(task, traffic)
         in_order = np.array_equal(task.first, np.arange(task.n_places))
         self._places = slice(None) if in_order else task.first
+        self._zero = np.zeros((task.n_episodes, task.n_places))
 
     def _sensitivity(self, group: int) -> Sensitivity:
         task, corridor = self.task, self.task.corridor
@@ -257,9 +242,22 @@ class Paper(GaussianRelease):
         """See `GaussianRelease.true_values`."""
         task = self.task
         if not task.is_whole:
-            return self.mean_values(request)
+            return self._means(request)
         values = self.traffic.aggregates(request.traffic, request.times, task.n_places)
         return values[:, self._places] * self.unit[:, None]
+
+    def _means(self, request: Request) -> FloatArray:
+        """Return `true_values` of the vehicles that each column sees.
+
+        Without any of them the speed limit is the mean; unobserved columns hold these, too.
+        """
+        task = self.task
+        sums = self.sums(request, self._zero)
+        counts = sums[..., 0].copy()
+        sums[..., 0] /= task.length
+        sums[..., 1] = np.where(counts == 0.0, task.limit, sums[..., 1] / np.maximum(counts, 1.0))
+        sums *= self.unit[:, None]
+        return sums
 
 
 class Corrected(Paper):
@@ -284,7 +282,6 @@ class CappedSettings(PrivacySettings):
         cap: Queried steps in which a vehicle counts, for the unit ``trip``.
         adjacency: Difference of two adjacent records: ``replace`` or ``add_remove``.
         share: Part of the budget mu^2 for the density.
-        speed_release: ``flow``, or ``mean`` for mean speeds, which void the guarantee.
 
     Raises:
         ValueError: A field is out of range; the message names its path below ``privacy``.
@@ -297,16 +294,6 @@ class CappedSettings(PrivacySettings):
     cap: Annotated[int, Interval(1, 1_000_000)] = 64
     adjacency: Adjacency = "replace"
     share: Annotated[float, Interval(0.001, 0.999)] = 0.5
-    speed_release: SpeedRelease = "flow"
-
-    def __post_init__(self) -> None:
-        """Check the fields, and that they are compatible."""
-        super().__post_init__()
-        if self.speed_release == "mean" and self.adjacency == "add_remove":
-            raise ValueError(
-                "privacy.adjacency must be 'replace' where mean speeds are released, got "
-                "'add_remove': without its one vehicle a segment has no mean"
-            )
 
     @property
     def contribution_cap(self) -> int | None:
@@ -342,27 +329,25 @@ class Capped(GaussianRelease):
     needs_vehicles: ClassVar[bool] = True
 
     @classmethod
-    def flow_centre(cls, corridor: Corridor, settings: CappedSettings) -> float | None:
+    def flow_centre(cls, corridor: Corridor, settings: CappedSettings) -> float:
         """Return half of the largest speed limit, the centre of the speeds clipped to it."""
-        return 0.5 * corridor.largest_speed_limit if settings.speed_release == "flow" else None
+        return 0.5 * corridor.largest_speed_limit
 
     def _ledgers(self) -> Ledgers:
         """Return ledgers by which a vehicle counts as often as the cap allows in each group."""
         task, cap = self.task, self.task.settings.contribution_cap
         budget = np.full(len(task.groups), math.inf if cap is None else float(cap))
-        clip = math.inf if task.flow_centre is None else task.flow_centre
+        clip = self.flow_centre(task.corridor, task.settings)
         fastest = task.corridor.largest_speed_limit
         return Ledgers(task.columns, task.n_episodes, budget, clip=clip, fastest=fastest)
 
     def _sensitivity(self, group: int) -> Sensitivity:
         corridor, settings = self.task.corridor, self.task.settings
-        slope = corridor.speed_scale / corridor.density_scale
         return contribution_sensitivity(
             contributions=settings.contributions(self.task.horizon),
             adjacency=settings.adjacency,
             segment_length=min(corridor.segment_lengths),
             largest_speed=corridor.largest_speed_limit,
-            mean_speed_slope=slope if settings.speed_release == "mean" else None,
         )
 
     def _noise_std(self, group: int) -> tuple[float, ...]:
@@ -372,7 +357,7 @@ class Capped(GaussianRelease):
         return tuple(factor * std for std in noise)
 
     def _void_reasons(self) -> tuple[str, ...]:
-        return ("speed_sensitivity",) if self.task.settings.speed_release == "mean" else ()
+        return ()
 
     @property
     def protected(self) -> str:
@@ -389,8 +374,6 @@ class Capped(GaussianRelease):
 
     def true_values(self, request: Request) -> FloatArray:
         """See `GaussianRelease.true_values`; unobserved columns hold zeros."""
-        if not self.task.releases_flow:
-            return self.mean_values(request)
         return self.sums(request, self._centre)
 
     def budgets_spent(self, episodes: IntArray) -> FloatArray:

@@ -29,9 +29,9 @@ CENTRE = 0.5 * SHORT_HIGHWAY.speed_limit
 R = SHORT_HIGHWAY.n_boundaries
 
 
-def make(kind, speeds="flow", n_episodes=1):
-    """A boundary of the short road, and its model; of released flows or mean speeds."""
-    privacy = {"preset": "capped", "boundary_inputs": kind, "speed_release": speeds}
+def make(kind, preset="capped", n_episodes=1):
+    """A boundary of the short road, and its model; `corrected` releases mean speeds."""
+    privacy = {"preset": preset, "boundary_inputs": kind}
     keywords = {"privacy": privacy, "traffic_seeds": "0:2", "parameters": "w99-3lane"}
     config = resolve("short-highway", keywords)
     release, model = make_release(config, n_episodes), make_model(config)
@@ -62,7 +62,7 @@ def at(boundary, time, index=0, episode=0):
 
 
 def test_true_inputs_are_those_of_the_boundary_segments_and_nominal_ones_the_demand():
-    true, model = make("true", "mean")
+    true, model = make("true", "corrected")
     nominal, _ = make("nominal")
     table = nominal_inputs(SHORT_HIGHWAY, model)
     for index, time in ((0, 0), (0, 150), (1, 150), (1, 240)):
@@ -106,16 +106,16 @@ def test_a_release_is_read_within_what_a_road_can_hold(density, speed, read_dens
     np.testing.assert_allclose(at(boundary, 1), model.boundary_inputs(*read)[0], rtol=1e-12)
 
 
-@pytest.mark.parametrize("speeds", ["mean", "flow"])
-def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(speeds):
-    boundary, model = make("private", speeds)
+@pytest.mark.parametrize(("preset", "centre"), [("corrected", None), ("capped", CENTRE)])
+def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(preset, centre):
+    boundary, model = make("private", preset)
     layout, v_f = model.layout, model.parameters.free_flow_speed
     state = model.project(np.full((1, model.n_states), 30.0))
     size = st.floats(-1e7, 1e7) | st.sampled_from([0.0, -1e-300, 1e-300, 9.999, 10.0])
 
     @given(arrays(float, (2, 1, R), elements=size))
     def check(released):
-        take(boundary, *released, CENTRE if speeds == "flow" else None)
+        take(boundary, *released, centre)
         inputs = at(boundary, 1)
         assert np.isfinite(inputs).all()
         assert (inputs >= 0.0).all()
@@ -125,7 +125,7 @@ def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(spe
         assert np.isfinite(model.step(state, inputs[None])).all()
 
     check()
-    take(boundary, np.full((1, R), 30.0), 60.0, CENTRE if speeds == "flow" else None)
+    take(boundary, np.full((1, R), 30.0), 60.0, centre)
     expected = model.boundary_inputs(*np.broadcast_to([[[30.0]], [[60.0]]], (2, 1, R)))
     np.testing.assert_allclose(at(boundary, 1), expected[0], rtol=1e-12)
 

@@ -52,8 +52,6 @@ SENSITIVITY_REASONS = ("average_dwell", "adaptive_queries", "speed_sensitivity")
         ({"cap": 0}, r"cap must be .* 1\.\.1000000, got 0$"),
         ({"share": 0.0}, r"share must be .* \[0\.001, 0\.999\], got 0\.0$"),
         ({"unit": np.zeros(2)}, r"unit must be one of 'trip', 'horizon', 'event', got array"),
-        # A segment without its one vehicle has no mean.
-        ({"adjacency": "add_remove", "speed_release": "mean"}, "adjacency must be 'replace'"),
     ],
 )
 def test_bad_settings_are_named_with_their_path(fields, message):
@@ -94,23 +92,13 @@ def test_a_flow_is_a_sum_of_centred_and_clipped_speeds():
     np.testing.assert_array_equal(now[[3, 5]], 0.0)  # nobody there, and not queried
 
 
-def test_a_mean_is_over_those_that_count():
-    release = three_vehicles(cap=1, speed_release="mean")
-    np.testing.assert_allclose(true_values(release, 1, 1)[1], [20.0, 40.0])
-    now = true_values(release, 2, 1, 2, 5)
-    np.testing.assert_allclose(now[[1, 2]], [[0.0, 102.0]] * 2)  # both have counted before
-    np.testing.assert_allclose(now[5], [10.0, 102.0])
-
-
-@pytest.mark.parametrize("preset", ["paper", "capped"])
 @pytest.mark.parametrize(
     "groups", [WHOLE, (Group("queries", 0.5, Penetration(0.3)), Group("sensors", 0.5))]
 )
-def test_an_empty_segment_or_sensor_has_its_own_speed_limit(preset, groups):
+def test_an_empty_segment_or_sensor_has_its_own_speed_limit(groups):
     road = dataclasses.replace(short_road(1), fixed_sensors=(3, 5, 7), ramp_speed_limit=60.0)
-    means = {"speed_release": "mean"} if preset == "capped" else {}
-    asked = RELEASE_MODELS[preset].settings_type(preset=preset, **means)
-    release = Worlds(stays(0, 0.0, 1, present=False), road=road).started(asked, groups=groups)
+    empty = Worlds(stays(0, 0.0, 1, present=False), road=road)
+    release = empty.started(PrivacySettings("paper"), groups=groups)
     every, task = np.array(road.with_boundaries(road.speed_limits)), release.task
     found = release.true_values(request(1, n_columns=task.n_columns))
     np.testing.assert_array_equal(found[0, :, 1], every[task.first])
@@ -260,12 +248,6 @@ def test_the_sensitivity_of_the_paper_is_exceeded():
     assert found > 3.0 * claimed.mu**2
 
 
-def test_mean_speeds_exceed_mu():
-    worlds, mu = Worlds(stays(2, 0.0), stays(2, LIMIT)), mu_of(1.0, 0.05)
-    means = worlds.release(CappedSettings(cap=4, speed_release="mean"))
-    assert squared_distance(means, ALL) > 100.0 * mu**2
-
-
 # --- reports -------------------------------------------------------------------------------------
 
 
@@ -358,10 +340,10 @@ def test_a_guarantee_is_claimed_for_its_unit_and_charged_until_its_cap(
     np.testing.assert_array_equal(epsilon, [0.0, *expected])
 
 
-def test_mean_speeds_and_true_boundary_inputs_void_the_guarantee():
-    found = privacy_report(capped(speed_release="mean", boundary_inputs="true"))
+def test_true_boundary_inputs_void_the_guarantee():
+    found = privacy_report(capped(boundary_inputs="true"))
     assert found.guarantee == "none"
-    assert found.void_reasons == ("speed_sensitivity", "boundary_inputs")
+    assert found.void_reasons == ("boundary_inputs",)
 
 
 def test_the_report_describes_the_noise_in_force():
