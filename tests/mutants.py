@@ -359,8 +359,9 @@ MUTANTS = (
         "release/test_pacing.py",
     ),
     Mutant(
-        "a trip without a cap has the noise of one that is capped", 13, "release/gaussian.py",
-        '"horizon": horizon, "event": 1}', '"horizon": self.cap, "event": 1}',
+        "a second has the noise of a trip", 13, "release/gaussian.py",
+        'return min(self.cap, horizon) if self.unit == "trip" else 1',
+        "return min(self.cap, horizon)",
         "test_guarantee.py",
     ),
     Mutant(

@@ -41,7 +41,7 @@ def test_seed_ranges():
 
 SUMS = "tests.helpers:SumRelease"
 PRIVACY = {
-    "preset": "capped", "epsilon": 2, "delta": 0.01, "unit": "horizon", "cap": 8,
+    "preset": "capped", "epsilon": 2, "delta": 0.01, "unit": "event", "cap": 8,
     "adjacency": "add_remove", "share": 0.25,
     "boundary_inputs": "private", "noise": "secure",
 }  # fmt: skip
@@ -205,8 +205,8 @@ def test_a_void_guarantee_is_warned_of_with_its_reason():
 
 
 def test_no_warning_where_no_guarantee_is_requested_or_it_holds():
-    whole = {"preset": "capped", "boundary_inputs": "private", "unit": "horizon"}
-    for privacy in ("paper", "corrected", "capped", whole):
+    second = {"preset": "capped", "boundary_inputs": "private", "unit": "event"}
+    for privacy in ("paper", "corrected", "capped", second):
         warn_where_void(resolve("private-highway", {"privacy": privacy}))  # would be an error here
 
 

@@ -229,7 +229,7 @@ def configuration(one_of):
             "price_levels": one_of((1.0,), (0.5, 4.0)),
         }
     else:
-        unit, cap = one_of(("trip", 7), ("trip", 1), ("horizon", 1), ("event", 1))
+        unit, cap = one_of(("trip", 7), ("trip", 1), ("trip", HORIZON), ("event", 1))
         privacy = CappedSettings(**given, unit=unit, cap=cap, share=one_of(0.1, 0.5, 0.8))
         options = {}
     if one_of(True, False):
@@ -390,7 +390,7 @@ WORST = {
         CappedSettings(unit="event", adjacency="add_remove"), BOTH_SEE, (1, 0.0), NOBODY,
     ),
     "capped, every second, at the boundary": (
-        CappedSettings(unit="horizon", boundary_inputs="private"), {}, (EXIT, 0.0), (1, 0.0),
+        CappedSettings(cap=HORIZON, boundary_inputs="private"), {}, (EXIT, 0.0), (1, 0.0),
     ),
     "paced": (PacedSettings(pacing=AtOnce), {}, (1, 0.0), (3, 0.0)),
     "paced, by queries and sensors": (

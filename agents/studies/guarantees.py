@@ -104,7 +104,7 @@ TRIP, PAPER, CORRECTED = "trip, C = 64", "`paper` noise", "`corrected` noise"
 PROTECTIONS: dict[str, dict[str, Any]] = {
     "event": {"preset": "capped", "unit": "event"},
     **{f"trip, C = {c}": {"preset": "capped", "unit": "trip", "cap": c} for c in (4, 16, CAP)},
-    "horizon": {"preset": "capped", "unit": "horizon"},
+    "horizon": {"preset": "capped", "unit": "trip", "cap": 700},
     PAPER: {"preset": "paper"},
     CORRECTED: {"preset": "corrected"},
 }

@@ -40,8 +40,8 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.fields import Interval
 from dptse_env.utils.vector_info import Rows, object_array
 
-Unit = Literal["trip", "horizon", "event"]
-"""Unit of protection: a trip with capped contributions, a complete trip, or a second of it."""
+Unit = Literal["trip", "event"]
+"""Unit of protection: a trip with capped contributions, or a second of it."""
 
 
 class GaussianRelease(ReleaseModel):
@@ -277,9 +277,9 @@ class CappedSettings(PrivacySettings):
 
     Attributes:
         unit: Unit of protection: ``trip``, a vehicle's trip, which counts in its first ``cap``
-            queried steps; ``horizon``, a trip without a cap, charged for every step of an episode;
-            ``event``, one second of a trip.
-        cap: Queried steps in which a vehicle counts, for the unit ``trip``.
+            queried steps; ``event``, one second of a trip.
+        cap: Queried steps in which a vehicle counts, for the unit ``trip``; one of the length of an
+            episode leaves out none.
         adjacency: Difference of two adjacent records: ``replace`` or ``add_remove``.
         share: Part of the budget mu^2 for the density.
 
@@ -302,17 +302,15 @@ class CappedSettings(PrivacySettings):
 
     def contributions(self, horizon: int) -> int:
         """Return the most steps of ``horizon`` in which the protected unit can count."""
-        return {"trip": min(self.cap, horizon), "horizon": horizon, "event": 1}[self.unit]
+        return min(self.cap, horizon) if self.unit == "trip" else 1
 
     @property
     def protected(self) -> str:
         """Description of the protected data and of the change that is protected."""
         change = CHANGES[self.adjacency]
-        return {
-            "trip": f"one vehicle's trip, which counts in {self.cap} queried steps, {change}",
-            "horizon": f"one vehicle's whole trip, {change}",
-            "event": f"one second of one vehicle's trip, {change}",
-        }[self.unit]
+        if self.unit == "trip":
+            return f"one vehicle's trip, which counts in {self.cap} queried steps, {change}"
+        return f"one second of one vehicle's trip, {change}"
 
 
 class Capped(GaussianRelease):

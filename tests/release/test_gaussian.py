@@ -51,7 +51,7 @@ SENSITIVITY_REASONS = ("average_dwell", "adaptive_queries", "speed_sensitivity")
         ({"delta": True}, r"delta must be .* \[1e-12, 0\.5\), got True$"),
         ({"cap": 0}, r"cap must be .* 1\.\.1000000, got 0$"),
         ({"share": 0.0}, r"share must be .* \[0\.001, 0\.999\], got 0\.0$"),
-        ({"unit": np.zeros(2)}, r"unit must be one of 'trip', 'horizon', 'event', got array"),
+        ({"unit": np.zeros(2)}, r"unit must be one of 'trip', 'event', got array"),
     ],
 )
 def test_bad_settings_are_named_with_their_path(fields, message):
@@ -62,9 +62,9 @@ def test_bad_settings_are_named_with_their_path(fields, message):
 
 
 def test_a_unit_bounds_how_often_it_counts_and_boundaries_are_nominal_unless_given():
-    trip, horizon, event = (CappedSettings(unit=unit) for unit in ("trip", "horizon", "event"))
-    assert [each.contributions(100) for each in (trip, horizon, event)] == [64, 100, 1]
-    assert [each.contribution_cap for each in (trip, horizon, event)] == [64, None, None]
+    trip, event = (CappedSettings(unit=unit) for unit in ("trip", "event"))
+    assert [each.contributions(100) for each in (trip, event)] == [64, 1]
+    assert [each.contribution_cap for each in (trip, event)] == [64, None]
     assert trip.contributions(10) == 10
     assert (PrivacySettings().boundary, trip.boundary) == ("true", "nominal")
     assert CappedSettings(boundary_inputs="true").boundary == "true"
@@ -84,7 +84,7 @@ def true_values(release, time, *queried):
 
 
 def test_a_flow_is_a_sum_of_centred_and_clipped_speeds():
-    release = three_vehicles(unit="horizon")
+    release = three_vehicles()
     np.testing.assert_array_equal(true_values(release, 1, 1)[1], [2.0, (20 - 51) + (60 - 51)])
     now = true_values(release, 2, 1, 2, 3)
     np.testing.assert_array_equal(now[1], [1.0, 51.0])  # 150 km/h is clipped to 102
@@ -107,20 +107,20 @@ def test_an_empty_segment_or_sensor_has_its_own_speed_limit(groups):
 
 def test_the_cap_belongs_to_trips_and_without_it_values_are_the_aggregates():
     whole, some = crowd(), np.arange(COLUMNS) < 3
-    settings = [CappedSettings(cap=3, unit=unit) for unit in ("trip", "horizon", "event")]
-    every = PrivacySettings("corrected"), *settings
-    aggregates, trip, horizon, event = (Worlds(whole).started(asked) for asked in every)
+    asked = {"cap": 3}, {"cap": T}, {"unit": "event"}
+    every = PrivacySettings("corrected"), *(CappedSettings(**each) for each in asked)
+    aggregates, trip, whole_trip, event = (Worlds(whole).started(asked) for asked in every)
     for t in range(1, T + 1):
         true, capped, uncapped, seconds = (
             release.true_values(request(t, some))[0, :3]
-            for release in (aggregates, trip, horizon, event)
+            for release in (aggregates, trip, whole_trip, event)
         )
         np.testing.assert_allclose(uncapped[:, 0], LENGTH * true[:, 0])
         np.testing.assert_allclose(seconds, uncapped, atol=0.5)  # on a grid of another noise
     assert (capped[:, 0] < uncapped[:, 0]).any()
     seen = (whole.step > 0) & (whole.segment < 3)
     met = np.bincount(whole.vehicle[seen], minlength=whole.n_vehicles)
-    np.testing.assert_array_equal(horizon.private(ONE, ONE)["exposures"][0], met)
+    np.testing.assert_array_equal(whole_trip.private(ONE, ONE)["exposures"][0], met)
     told, counted = trip.private(ONE, ONE), np.minimum(met, 3)
     np.testing.assert_array_equal(told["exposures"][0], counted)
     assert {type(n) for n in told["exposures"][0]} == {int}
@@ -130,7 +130,7 @@ def test_the_cap_belongs_to_trips_and_without_it_values_are_the_aggregates():
     assert told["individual_epsilon"][0] == pytest.approx(exact)
     assert len(set(exact)) == 4
     assert trip.budgets_spent(ONE) == pytest.approx([counted.sum() / 3.0])
-    assert horizon.budgets_spent(ONE).tolist() == [0.0]
+    assert event.budgets_spent(ONE).tolist() == [0.0]
 
 
 @pytest.mark.parametrize("preset", ["paper", "corrected", "capped"])
@@ -175,7 +175,7 @@ def squared_distance(release, queries, std=None):
 WISHES = st.builds(
     CappedSettings,
     epsilon=st.sampled_from([0.5, 5.0]),
-    unit=st.sampled_from(["trip", "horizon", "event"]),
+    unit=st.sampled_from(["trip", "event"]),
     cap=st.sampled_from([1, 3, 64]),
     adjacency=st.sampled_from(["replace", "add_remove"]),
     share=st.sampled_from([0.1, 0.5, 0.8]),
@@ -314,7 +314,7 @@ def capped(cap=16, horizon=100, **privacy):
 @pytest.mark.parametrize(
     ("unit", "adjacency", "share", "boundary_inputs"),
     pairwise(
-        ["trip", "horizon", "event"], ["replace", "add_remove"], [0.2, 0.7], [None, "private"],
+        ["trip", "event"], ["replace", "add_remove"], [0.2, 0.7], [None, "private"],
         n=4, rest=False,
     ),
 )  # fmt: skip
@@ -333,7 +333,7 @@ def test_a_guarantee_is_claimed_for_its_unit_and_charged_until_its_cap(
     assert found.mu == pytest.approx(mu_of(5.0, 0.05), rel=1e-12)
     assert found.epsilon == pytest.approx(5.0, rel=1e-9)
     mu, epsilon = make_release(config).spent(np.arange(101), np.arange(101))
-    whole = {"trip": 16, "horizon": 100, "event": 1}[unit]
+    whole = {"trip": 16, "event": 1}[unit]
     parts = np.minimum(np.arange(101), whole) / whole
     np.testing.assert_allclose(mu, found.mu * np.sqrt(parts), rtol=1e-14)
     expected = [epsilon_of(value, 0.05) for value in mu[1:].tolist()]

@@ -70,8 +70,7 @@ CAPPED = [
 MORE_CAPPED = [
     config(adjacency="add_remove"),
     config(share=0.2),
-    config(unit="horizon"),
-    config(unit="horizon", horizon=10),
+    config(cap=20, horizon=10),
     config(unit="event"),
     config(cap=500),
     dataclasses.replace(config(), corridor=dataclasses.replace(ROAD, fixed_sensors=())),
