@@ -82,7 +82,7 @@ class Cell:
 
     @property
     def all_keywords(self) -> dict[str, Any]:
-        """Keywords of ``gym.make``; where they name no encoding of actions, that of the policy."""
+        """Keywords of ``gym.make``; those of the policy where they do not name others."""
         return {**find_policy(self.policy).keywords, **self.keywords}
 
     def check(self) -> None:
@@ -101,7 +101,7 @@ class Cell:
             seconds, allowed = env.config.horizon_steps, f"above the {WARM_UP} s that do not count"
             require(seconds > WARM_UP, "horizon or the road's duration", allowed, seconds)
             env.process  # noqa: B018 (an estimator refuses a road when it is made)
-            self.load_policy(env)
+        self.load_policy(env)
 
     def load_policy(self, env: Any) -> Any:
         """Bind the policy to an environment.

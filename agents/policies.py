@@ -17,6 +17,7 @@ from dptse_env.evaluation import Policy
 from dptse_env.policies import DETERMINISTIC, SUFFIX, read_policy, shipped_policies
 from dptse_env.schedules import make_schedule
 from dptse_env.utils.files import file_digest
+from dptse_env.utils.registry import require_registered
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class NamedSchedule:
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """Keywords of the environment that suits it best: none, schedules speak every encoding."""
+        """Keywords of the environment that it fits: none, schedules speak every encoding."""
         return {}
 
     @property
@@ -78,8 +79,16 @@ class SavedPolicy:
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """Keywords of the environment that suits it best: its action encoding."""
-        return {"action": self.action}
+        """Keywords of the environment that it fits: its actions, and its observation if named.
+
+        Raises:
+            ValueError: A block of the observation is no registered name.
+        """
+        own: dict[str, Any] = {"action": self.action}
+        if (blocks := self.card["keywords"].get("observation")) is not None:
+            require_registered(blocks, f"{self.source}: keywords.observation")
+            own["observation"] = blocks
+        return own
 
     @property
     def action(self) -> str:

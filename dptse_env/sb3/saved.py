@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
 from dptse_env.policies import DETERMINISTIC, DRAWN, SUFFIX, TRANSFERABLE, read_policy
 from dptse_env.sb3.road_policy import MOST_NEIGHBOURS, RoadChannels, RoadPolicy, config_of
-from dptse_env.spaces.actions import ACTION_ENCODINGS, MaskAction, PendingPicks
+from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import Action, AnyArray, BoolArray, FloatArray, Observation
 from dptse_env.utils.fields import integer, require, require_name, shown
@@ -153,25 +154,8 @@ def _moments(scaled: VecNormalize) -> tuple[Any, Any]:
     return statistics.mean, statistics.var
 
 
-class Memory(NamedTuple):
-    """Memory of a policy that acts in another encoding than its own.
-
-    Attributes:
-        state: Of the policy itself.
-        pending: Of its own encoding.
-        wanted: The options of the decision in progress, shape (k, n_options).
-    """
-
-    state: Any
-    pending: PendingPicks
-    wanted: BoolArray
-
-
 class ActingPolicy:
     """A policy of stable-baselines3 that acts in an environment of this package.
-
-    Where the environment has another encoding of actions than the policy, the options that the
-    policy wants are found by its own encoding, and asked for by that of the environment.
 
     Attributes:
         policy: The policy of stable-baselines3.
@@ -187,7 +171,6 @@ class ActingPolicy:
         interface: QueryInterface,
         card: Mapping[str, Any] | None = None,
         normalisation: VecNormalize | Normalisation | None = None,
-        own: QueryInterface | None = None,
     ) -> None:
         """Bind a policy to an environment's interface.
 
@@ -197,19 +180,12 @@ class ActingPolicy:
             card: Its card, if it has one.
             normalisation: Of its observations; the statistics of a ``VecNormalize`` are those of
                 this moment.
-            own: Interface of the environments that it was trained in, if that is another.
-
-        Raises:
-            ValueError: Its actions cannot be said in the encoding of the environment.
         """
         if isinstance(normalisation, VecNormalize):
             normalisation = Normalisation.of(normalisation)
         self.policy, self.interface, self.card = policy, interface, dict(card or {})
         self.deterministic = self.card.get("acts", DETERMINISTIC) == DETERMINISTIC
-        self._normalisation, self._own = normalisation, own or interface
-        self._is_at_home = type(self._own.actions) is type(interface.actions)
-        if not self._is_at_home:
-            _check_translation(self._own, interface)
+        self._normalisation = normalisation
         # A maskable policy expects masks as an argument; they are part of the observation.
         self._takes_masks = type(policy).__name__ == "MaskableActorCriticPolicy"
 
@@ -234,91 +210,20 @@ class ActingPolicy:
         if episode_start is not None:
             shape = np.shape(observation)[:-1] or (1,)
             episode_start = np.broadcast_to(episode_start, shape).astype(bool)
-        if self._is_at_home:
-            return self._act(np.asarray(observation), state, episode_start, deterministic)
-        batch = np.atleast_2d(observation)
-        action, state = self._translated(batch, state, episode_start, deterministic)
-        return (action[0] if np.ndim(observation) == 1 else action), state
-
-    def _act(
-        self, observation: Observation, state: Any, start: BoolArray | None, deterministic: bool
-    ) -> tuple[Action, Any]:
-        """Return actions in the policy's own encoding for observations as it was trained on."""
-        extra: dict[str, Any] = {}
+        observation, extra = np.asarray(observation), {}
         if self._takes_masks:
             extra["action_masks"] = self._masks(observation)
         if self._normalisation is not None:
             observation = self._normalisation(observation)
-        return self.policy.predict(observation, state, start, deterministic, **extra)
+        return self.policy.predict(observation, state, episode_start, deterministic, **extra)
 
     def _masks(self, observation: Observation) -> BoolArray:
         """Return the options that may be picked next, (G,) or (k, G)."""
-        actions = self._own.actions
-        picked = np.atleast_2d(_picked(self._own, observation))
-        return actions.available(picked).reshape(*observation.shape[:-1], actions.n_options)
-
-    def _translated(
-        self, batch: Observation, memory: Memory | None, start: BoolArray | None, likeliest: bool
-    ) -> tuple[Action, Memory]:
-        """Return actions (k, ...) in the encoding of the environment."""
-        k, n = len(batch), self._own.actions.n_options
-        if memory is None:
-            memory = Memory(None, PendingPicks(k, n), np.zeros((k, n), dtype=bool))
-        elif start is not None:
-            memory.pending.reset(np.flatnonzero(start))
-        picked = _picked(self.interface, batch)
-        fresh = ~picked.any(axis=1, keepdims=True)
-        if fresh.any():  # the last pick was of an earlier second
-            decided = self._decide(batch, memory, start, likeliest)
-            wanted = np.where(fresh, decided.wanted, memory.wanted)
-            memory = decided._replace(wanted=wanted)
-        return self.interface.actions.encode(memory.wanted, picked), memory
-
-    def _decide(
-        self, batch: Observation, memory: Memory, start: BoolArray | None, likeliest: bool
-    ) -> Memory:
-        """Let the policy choose options in its own encoding, by one action or one after another."""
-        every, (state, pending, _) = np.arange(len(batch)), memory
-        wanted, complete = pending.picked, np.zeros(len(batch), dtype=bool)
-        while not complete.all():
-            seen = self._as_trained(batch, wanted)
-            action, state = self._act(seen, state, start, likeliest)
-            wanted, _, complete = self._own.actions.decode(every, action, pending)
-            start = None if start is None else np.zeros_like(start)
-        return Memory(state, pending, wanted)
-
-    def _as_trained(self, batch: Observation, picked: BoolArray) -> Observation:
-        """Return observations (k, size) as the environments of the training gave them."""
-        here = self.interface.observations
-        blocks = [
-            here.block(batch, name) if name in here.slices else picked.astype(np.float32)
-            for name in self._own.observations.slices
-        ]
-        return np.concatenate(blocks, axis=1)
-
-
-def _picked(interface: QueryInterface, observation: Observation) -> BoolArray:
-    """Return the options picked so far for the next query, (n_options,) or (k, n_options)."""
-    if "picked" not in interface.observations.slices:
-        return np.zeros((*observation.shape[:-1], interface.actions.n_options), dtype=bool)
-    picked: BoolArray = interface.observations.block(observation, "picked") > 0
-    return picked
-
-
-def _check_translation(own: QueryInterface, other: QueryInterface) -> None:
-    """Refuse encodings between which sets of options cannot be translated."""
-    there, here = (type(each.actions).__name__ for each in (own, other))
-    if isinstance(own.actions, MaskAction):
-        raise ValueError(
-            f"its actions ({there}) may query less than the bandwidth pays for, which those of the "
-            f"environment ({here}) cannot: make the environment with action='mask'"
-        )
-    one_by_one = own.actions.picks_one_by_one or other.actions.picks_one_by_one
-    if one_by_one and own.queries.costs_differ:
-        raise ValueError(
-            f"actions cannot be translated from {there} to {here} where queries cost different "
-            "amounts and one encoding picks one by one: make the environment with its own encoding"
-        )
+        actions, observations = self.interface.actions, self.interface.observations
+        picked = np.zeros((*observation.shape[:-1], actions.n_options), dtype=bool)
+        if "picked" in observations.slices:
+            picked = observations.block(observation, "picked") > 0
+        return actions.available(np.atleast_2d(picked)).reshape(picked.shape)
 
 
 def save_policy(
@@ -401,9 +306,8 @@ def load_policy(
         source: A file, or the name of a policy that comes with the package
             (`dptse_env.policies`).
         env: The environment in which it acts: of this package, scalar or vector, wrapped or not,
-            or as an `SB3VecEnv`. Its actions may be in another encoding than those of the
-            policy, which are translated then; only actions of ``mask``, which may query less than
-            the bandwidth pays for, fit no other encoding.
+            or as an `SB3VecEnv`. Its keyword ``action`` is the policy's, ``fits.action`` of its
+            card.
         allow: Properties that may differ on purpose, of `TRANSFERABLE`. Estimator, privacy and
             traffic model may always differ. With ``"corridor"`` a `RoadPolicy` acts on
             roads of any size whose observations have the same channels (`RoadChannels`); a
@@ -413,6 +317,9 @@ def load_policy(
         FileNotFoundError: There is no such file, nor such a name.
         ValueError: The file is not a saved policy, or the policy does not fit the environment: the
             message names the values of both.
+
+    Warns:
+        UserWarning: It was trained at another epsilon, and ``allow`` is empty.
     """
     unknown = [name for name in allow if name not in TRANSFERABLE]
     if unknown:
@@ -420,13 +327,18 @@ def load_policy(
     config = config_of(env)
     file = read_policy(source)
     try:
-        own = dataclasses.replace(config, action=file.card["fits"]["action"])
-        _check_fit(file.card, own, allow)
-        policy, normalisation = _made(file.card, dict(file.weights), own)
-        interface = make_interface(config)
-        return ActingPolicy(policy, interface, file.card, normalisation, make_interface(own))
+        _check_fit(file.card, config, allow)
+        policy, normalisation = _made(file.card, file.weights, config)
     except ValueError as problem:
         raise ValueError(f"policy {file.source!r} cannot be loaded: {problem}") from problem
+    there, here = file.card.get("epsilon"), config.privacy.epsilon
+    if there != here and not allow:
+        warnings.warn(
+            f"policy {file.source!r} was trained at epsilon {shown(there)}, and the environment "
+            f"has epsilon {here:g}",
+            stacklevel=1,
+        )
+    return ActingPolicy(policy, make_interface(config), file.card, normalisation)
 
 
 def describe_road(corridor: Corridor) -> str:
@@ -466,7 +378,7 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
         ValueError: A property outside `allow` differs; the message names the values of both.
     """
     there, here = card["fits"], _fit(config, card["policy"]["class"])
-    pairs = {key: (there.get(key), here[key]) for key in ("format", "bandwidth")}
+    pairs = {key: (there.get(key), here[key]) for key in ("format", "action", "bandwidth")}
     pairs["queries"] = there.get("queries", _PLAIN), here.get("queries", _PLAIN)
     road_there, road_here = there["corridor"], here["corridor"]
     observations = there.get("observation"), here["observation"]
@@ -491,7 +403,9 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
             f"{key} is {shown(there)} for the policy and {shown(here)} for the environment"
             for key, (there, here) in refused.items()
         )
-        if all(key in TRANSFERABLE for key in refused):
+        if "action" in refused:
+            text += f"; make the environment with action={shown(there['action'])}"
+        elif all(key in TRANSFERABLE for key in refused):
             text += f"; to transfer it on purpose, allow {' and '.join(sorted(refused))}"
         raise ValueError(text)
 

@@ -7,11 +7,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents.play import Cell
 from agents.policies import find_policy, read_saved_policy
 from dptse_env import sb3
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.schedules import make_schedule
-from tests.helpers import SHORT, save_untrained
+from tests.helpers import ABOUT, SHORT, save_untrained, untrained
 from tests.hostile import edited
 
 
@@ -34,6 +35,19 @@ def test_a_saved_policy_acts_as_it_did_where_it_fits_and_while_its_file_stays(tm
     save_untrained(path, seed=1)
     with pytest.raises(ValueError, match="has changed"):
         saved.load(env)
+
+
+def test_its_environment_has_the_blocks_that_it_was_trained_on(tmp_path):
+    path, blocks = tmp_path / "policy.safetensors", ["age", "speed"]
+    policy, config = untrained("scores", observation=blocks)
+    about = {**ABOUT, "keywords": {"observation": blocks}}
+    sb3.save_policy(path, policy, config, **about)
+    assert read_saved_policy(path).keywords == {"action": "scores", "observation": blocks}
+    Cell(SHORT, str(path), {"bandwidth": 2, "horizon": 70}).check()
+    about["keywords"]["observation"] = ["mine:Block"]
+    sb3.save_policy(path, policy, config, **about)
+    with pytest.raises(ValueError, match=r"keywords\.observation\[0\] must be a registered name"):
+        read_saved_policy(path).keywords  # noqa: B018
 
 
 def test_what_is_no_policy_is_refused(tmp_path):

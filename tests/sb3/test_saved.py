@@ -1,6 +1,7 @@
 """Saved policies: they act as before, where they fit, and files that mislead are refused."""
 
 import importlib
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +13,6 @@ pytest.importorskip("sb3_contrib")
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
@@ -151,68 +151,6 @@ def test_the_card_says_whether_actions_are_drawn(path):
             assert (actions == actions[0]).all() == same
 
 
-def queried(policy, env, seconds=20):
-    """Options queried in each second of an episode."""
-    observation, _ = env.reset(seed=0)
-    start, state, found = True, None, []
-    while len(found) < seconds:
-        action, state = policy.predict(observation, state, np.array([start]))
-        before, start = env.unwrapped.process.time.copy(), False
-        observation, *_, info = env.step(action)
-        if (env.unwrapped.process.time > before).all():
-            assert info["n_dropped"] == 0
-            found.append(info["queried"].tolist())
-    return found
-
-
-@pytest.mark.parametrize("action", ["mask", "scores", "sequential"])
-def test_a_policy_asks_for_its_segments_in_another_encoding(stored, action):
-    env = make_env(action=action, bandwidth=2)
-    assert queried(load_policy(stored, env), env) == queried(
-        load_policy(stored, home := make_env(bandwidth=2)), home
-    )
-
-
-def test_a_policy_that_picks_one_by_one_acts_where_all_are_asked_for_at_once(path):
-    for name in ("MaskableActorCriticPolicy", "DQNPolicy"):
-        policy, config, action = make(name)
-        save_policy(path, policy, config, **ABOUT)
-        home, env = make_env(action=action), make_env(action="slots")
-        if name == "DQNPolicy":  # picks what it has picked already, and has it replaced
-            load_policy(path, env).predict(observe(env))
-        else:
-            expected = queried(load_policy(path, home), home)
-            assert queried(load_policy(path, env), env) == expected
-
-
-def test_a_memory_is_kept_from_second_to_second_in_another_encoding(path):
-    policy, config = recurrent("slots")
-    save_policy(path, policy, config, **ABOUT)
-    home, env = make_env(), make_env(action="sequential")
-    assert queried(load_policy(path, env), env) == queried(load_policy(path, home), home)
-
-
-def recurrent(action):
-    config = resolve("short-highway", {"action": action})
-    interface = make_interface(config)
-    torch.manual_seed(0)
-    policy = RecurrentActorCriticPolicy(
-        interface.observations.space, interface.actions.space, lambda _: 1.0, lstm_hidden_size=8
-    )
-    with torch.no_grad():
-        policy.action_net.weight *= 100.0  # the smallest changes of the memory count
-    return policy, config
-
-
-def test_encodings_that_cannot_be_translated_are_refused(tmp_path):
-    masks = save_untrained(tmp_path / "masks.safetensors", "mask")
-    with pytest.raises(ValueError, match=r"may query less .* with action='mask'"):
-        load_policy(masks, make_env())
-    scores = save_untrained(tmp_path / "scores.safetensors", "scores", **SPANS)
-    with pytest.raises(ValueError, match="where queries cost different amounts"):
-        load_policy(scores, make_env(action="sequential", **SPANS))
-
-
 def test_it_is_loaded_for_any_form_of_the_environment(stored):
     vector = gym.make_vec(
         SHORT, num_envs=3, action="slots", traffic_seeds="0:2", autoreset_mode="SameStep"
@@ -244,6 +182,11 @@ def test_the_card_describes_the_policy(stored):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
+        (
+            {"action": "mask"},
+            "action is 'slots' for the policy and 'mask' for the environment; make the environment "
+            "with action='slots'$",
+        ),
         ({"bandwidth": 3}, r"bandwidth is 2 for the policy and 3 for the environment"),
         (
             {"incident": "none"},
@@ -277,7 +220,8 @@ def test_a_shared_network_moves_on_purpose_to_another_road_and_bandwidth(path):
     ):
         with pytest.raises(ValueError, match=message):
             load_policy(path, env, allow=allow)
-    loaded = load_policy(path, env, allow=("bandwidth", "corridor"))
+    with warnings.catch_warnings(action="error"):  # of another epsilon
+        loaded = load_policy(path, env, allow=("bandwidth", "corridor"))
     # The same weights, made for the short road.
     direct, _ = untrained(bandwidth=3)
     direct.scorer.load_state_dict(policy.scorer.state_dict())
@@ -286,6 +230,11 @@ def test_a_shared_network_moves_on_purpose_to_another_road_and_bandwidth(path):
         loaded.predict(observation, deterministic=True)[0],
         direct.predict(observation, deterministic=True)[0],
     )
+
+
+def test_another_epsilon_is_told_unless_the_policy_moves_on_purpose(stored):
+    with pytest.warns(UserWarning, match=r"was trained at epsilon 1\.0, and .* has epsilon 0\.3$"):
+        load_policy(stored, make_env(epsilon=0.3))
 
 
 def test_a_perceptron_stays_on_its_road(path):
@@ -341,7 +290,7 @@ def arguments(**values):
 WRONG = {
     "slots": [
         (lambda c, w: c["fits"].update(format="dptse-policy-1"), "format is 'dptse-policy-1'"),
-        (lambda c, w: c["fits"].update(action="x" * 10**5), "action must be one of .*xxx"),
+        (lambda c, w: c["fits"].update(action="x" * 10**5), r"action is 'x+\.\.\.x+' for .*;"),
         (lambda c, w: c["fits"].update(dict.fromkeys(c["fits"], 400 * "x"), action="slots"),
          r"format is 'x+\.\.\.x+' for .*; corridor is .* for the environment$"),
         (lambda c, w: c["fits"]["channels"].append("colour"), r"channels is \['colour'\] for the"),
