@@ -1,7 +1,6 @@
 """`RoadPolicy`: scores every segment by one network, and queries an ordered set of them.
 
-Its parts come first: the distribution over ordered sets, the observation as channels along the
-road, the modules of the network.
+Its parts come first: the observation as channels along the road, the modules of the network.
 """
 
 from __future__ import annotations
@@ -12,13 +11,14 @@ from typing import Any
 
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import Tensor, nn
 
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface
+from dptse_env.sb3.plackett_luce import PlackettLuce
+from dptse_env.sb3.vec_env import config_of
 
 MOST_NEIGHBOURS = 16
 """Largest number of neighbours on either side that a convolution of a saved policy sees."""
@@ -57,106 +57,6 @@ RAMP_BLOCKS = ("density", "speed", "density_log_std", "speed_log_std")
 FIXED_SENSOR_BLOCKS = ("fixed_density_innovation", "fixed_speed_innovation")
 
 
-class PlackettLuce(Distribution):
-    """Draws B distinct items of n in turn, each by softmax over the remaining ones.
-
-    With scores s the probability of the ordered set a_1, .., a_B is
-
-        prod_j  exp(s[a_j]) / sum_{i not in a_1 .. a_{j-1}} exp(s[i])
-
-    (Plackett, 1975); for B = 1 it is a categorical distribution. Sampling needs no loop: the order
-    of the B largest scores after adding independent Gumbel noise to each has this distribution
-    (Yellott, 1977; Kool et al., 2019).
-
-    Attributes:
-        size: B, items to draw.
-        scores: Shape (k, n), the largest of each row at 0.
-    """
-
-    scores: Tensor
-
-    def __init__(self, size: int) -> None:
-        """Draw ``size`` items, by the scores that `proba_distribution` is given."""
-        super().__init__()  # type: ignore[no-untyped-call]
-        self.size = size
-
-    def proba_distribution_net(self) -> nn.Module:
-        """Return the module from scores to parameters of the distribution, which are the same."""
-        return nn.Identity()
-
-    def proba_distribution(self, scores: Tensor) -> PlackettLuce:
-        """Take the scores, shape (k, n), and return the distribution.
-
-        Raises:
-            ValueError: B is not in 1..n, or a score is not finite.
-        """
-        n = scores.shape[-1]
-        if not 1 <= self.size <= n:
-            raise ValueError(f"size must be in 1..{n}, got {self.size}")
-        if not bool(torch.isfinite(scores).all()):
-            raise ValueError("scores must be finite; a diverged training makes them NaN")
-        # Only differences matter. Centred scores are at most 0, so no exponential overflows, and
-        # neither do sums of a few of the lowest scores.
-        centred = scores - scores.amax(dim=-1, keepdim=True).detach()
-        self.scores = centred.clamp_min(torch.finfo(scores.dtype).min / (4 * n))
-        return self
-
-    def sample(self) -> Tensor:
-        """Return ordered sets drawn at random, shape (k, B)."""
-        # Minus the logarithm of a standard exponential is a standard Gumbel variable.
-        exponential = torch.empty_like(self.scores).exponential_()
-        noise = -exponential.clamp_min(torch.finfo(exponential.dtype).tiny).log()
-        return self._largest(self.scores.detach() + noise)
-
-    def mode(self) -> Tensor:
-        """Return the most probable ordered sets, shape (k, B); ties go upstream."""
-        return self._largest(self.scores.detach())
-
-    def log_prob(self, actions: Tensor) -> Tensor:
-        """Return the log-probabilities of ordered sets (k, B), shape (k,).
-
-        That of a set in which an item appears twice is minus infinity.
-
-        Raises:
-            ValueError: The shape is not (k, B).
-            RuntimeError: An index is out of range.
-        """
-        expected = (len(self.scores), self.size)
-        if actions.shape != expected:
-            raise ValueError(f"actions must have shape {expected}, got {tuple(actions.shape)}")
-        item, *others = torch.split(actions.long(), 1, dim=1)
-        logs = self._first
-        total = logs.gather(1, item)
-        for other in others:
-            logs = logs.scatter(1, item, -torch.inf).log_softmax(dim=1)
-            total, item = total + logs.gather(1, other), other
-        return total[:, 0]
-
-    def entropy(self) -> Tensor:
-        """Return B times the entropy of the first draw, shape (k,): the entropy for B = 1."""
-        logs = self._first
-        return -self.size * (logs.exp() * logs).sum(dim=1)
-
-    def actions_from_params(self, scores: Tensor, deterministic: bool = False) -> Tensor:
-        """Return the most probable ordered sets of scores (k, n), or drawn ones, shape (k, B)."""
-        return self.proba_distribution(scores).get_actions(deterministic)
-
-    def log_prob_from_params(self, scores: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ordered sets drawn by scores (k, n), and their log-probabilities (k,)."""
-        actions = self.actions_from_params(scores)
-        return actions, self.log_prob(actions)
-
-    @property
-    def _first(self) -> Tensor:
-        """Log-probabilities of the first draw, (k, n)."""
-        return self.scores.log_softmax(dim=1)
-
-    def _largest(self, keys: Tensor) -> Tensor:
-        if self.size == 1:
-            return keys.argmax(dim=1, keepdim=True)
-        return keys.argsort(dim=1, descending=True, stable=True)[:, : self.size]
-
-
 @dataclass(frozen=True)
 class Channel:
     """A channel of the observation, with a value for each mainline segment.
@@ -177,7 +77,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class RoadChannels:
-    """Layout of an observation along the road, as plain data that travels with a policy.
+    """Channels of an observation along the road, as plain data that travels with a policy.
 
     A ramp's values are assigned to the segment that it joins or leaves: an on-ramp at face j to
     segment j, downstream of the face, an off-ramp to segment j - 1. The bandwidth and epsilon are
@@ -198,7 +98,7 @@ class RoadChannels:
 
     @classmethod
     def from_config(cls, config: EnvConfig) -> RoadChannels:
-        """Return the layout of the observations of an environment of ``config``.
+        """Return the channels of the observations of an environment of ``config``.
 
         Raises:
             ValueError: Queries are not of single segments at one price level.
@@ -337,7 +237,7 @@ class RoadFeatures(nn.Module):
         return scaled.index_select(0, self.source).view(-1, self.n_inputs, rows.shape[1])
 
 
-class Windows(torch.autograd.Function):
+class Neighbourhoods(torch.autograd.Function):
     """The features (n, c, k) of each segment and its neighbours, (n, (2 reach + 1) c, k).
 
     Beyond the ends of the road they are 0. They are views of the padded features. The gradient is
@@ -386,9 +286,9 @@ class Trunk(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Return features (n, width, k) of inputs (n, n_inputs, k)."""
         near = in_each_segment(self.near, inputs).relu_()
-        windows = Windows.apply(near, self.reach)  # type: ignore[no-untyped-call]
+        around = Neighbourhoods.apply(near, self.reach)  # type: ignore[no-untyped-call]
         of_road = torch.addmm(self.whole.bias[:, None], self.whole.weight, near.mean(dim=0))
-        return in_each_segment(self.far, windows).add_(of_road).relu_()
+        return in_each_segment(self.far, around).add_(of_road).relu_()
 
 
 class Scorer(nn.Module):
@@ -441,8 +341,8 @@ class RoadPolicy(ActorCriticPolicy):
 
     Attributes:
         bandwidth: B, queries a step.
-        road: Layout of the observations.
-        sizes: Arguments other than the layout: ``width``, ``critic_width``, ``reach`` and
+        road: Channels of the observations.
+        sizes: Arguments other than ``road``: ``width``, ``critic_width``, ``reach`` and
             ``skips_sensors``, which leaves segments with a fixed sensor to that sensor, since it
             tells every second what a query would, as long as there are others to query.
         features: Module that arranges observations along the road.
@@ -471,7 +371,7 @@ class RoadPolicy(ActorCriticPolicy):
             observation_space: Flat observations of ``road.size`` numbers.
             action_space: ``MultiDiscrete([n] * B)``, of the encoding ``slots``.
             lr_schedule: Learning rate of the optimizer; none where another one trains the weights.
-            road: Layout of the observations, `RoadChannels.from_config` of the environment's
+            road: Channels of the observations, `RoadChannels.from_config` of the environment's
                 configuration.
             width: Features per segment of the actor.
             critic_width: Features per segment of the critic.
@@ -598,23 +498,10 @@ class RoadPolicy(ActorCriticPolicy):
         }
 
 
-def config_of(env: Any) -> EnvConfig:
-    """Return the configuration of an environment of this package, however it is wrapped.
-
-    Raises:
-        ValueError: Another environment.
-    """
-    base = env.unwrapped
-    config = getattr(base, "config", None) or getattr(getattr(base, "env", None), "config", None)
-    if not isinstance(config, EnvConfig):
-        raise ValueError(f"env must be an environment of this package, got {env}")
-    return config
-
-
 def _bandwidth(
     observations: spaces.Space[Any], actions: spaces.Space[Any], road: RoadChannels
 ) -> int:
-    """Return B of an action space, or refuse spaces that do not fit the layout."""
+    """Return B of an action space, or refuse spaces that do not fit the road."""
     if observations.shape != (road.size,):
         raise ValueError(
             f"observation_space must have shape {(road.size,)}, as in road, got {observations}"

@@ -12,6 +12,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from dptse_env.config import EnvConfig
 from dptse_env.utils.arrays import Action, Observation
 from dptse_env.utils.fields import integer
 from dptse_env.utils.vector_info import row_of
@@ -189,6 +190,19 @@ class SB3VecEnv(VecEnv):
         at_reset = self.env.process.reset_info()
         for k, episode in enumerate(episodes):
             self.reset_infos[episode] = {**row_of(rows, k), **at_reset}
+
+
+def config_of(env: Any) -> EnvConfig:
+    """Return the configuration of an environment of this package, however it is wrapped.
+
+    Raises:
+        ValueError: Another environment.
+    """
+    base = env.unwrapped
+    config = getattr(base, "config", None) or getattr(getattr(base, "env", None), "config", None)
+    if not isinstance(config, EnvConfig):
+        raise ValueError(f"env must be an environment of this package, got {env}")
+    return config
 
 
 class ReplicaBaseline(BaseCallback):
