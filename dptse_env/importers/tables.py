@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import csv
 import gzip
-import io
-import json
 import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -19,7 +17,6 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 from xml.parsers import expat
 
-import numpy as np
 import polars as pl
 from polars.io.plugins import register_io_source
 
@@ -39,11 +36,11 @@ vehicle of a row that tells a time alone; `bad` is the role of a field that is n
 BYTES = 40
 """Bytes that a point takes in XML or JSON at least."""
 BLOCK = 1 << 20
-"""Bytes of XML or JSON that are read at a time."""
+"""Bytes of XML that are read at a time."""
 CHUNK = 25_000
-"""Points of XML or JSON that are handed on together."""
-LONGEST_DOCUMENT = 16 << 20
-"""Characters of a JSON document after which the file is no array of vehicles."""
+"""Points of XML that are handed on together."""
+LARGEST_JSON = 1 << 28
+"""Bytes of a JSON file, which is read at once and takes up six times as much memory."""
 HEAD = 1 << 16
 """Bytes at the start of a text file by which its delimiter and columns are told."""
 PARQUET = (".parquet", ".pq")
@@ -112,7 +109,7 @@ def scan(path: Path, form: Format, source: Source) -> Points:
         TrajectoryError: There is no such file, its start is damaged, columns are missing, or a row
             of a text has too many or too few fields.
     """
-    raw, rows, grouped = _raw(path, form, source)
+    raw, rows, grouped = _raw(path, form)
     kinds = raw.collect_schema()
     names = [name for name in kinds.names() if name != ROW]
     roles = _roles(path, form, source, names)
@@ -161,7 +158,7 @@ def scan(path: Path, form: Format, source: Source) -> Points:
 
 def field_text(path: Path, form: Format, source: Source, row: int, role: str) -> tuple[str, str]:
     """Return the name of a role's column and the text of its field in a row, for messages."""
-    raw = _raw(path, form, source).frame
+    raw = _raw(path, form).frame
     name = _roles(path, form, source, raw.collect_schema().names()).get(role, role)
     text = raw.filter(pl.col(ROW) == row).select(pl.col(name).cast(pl.String)).head(1)
     value = text.collect(engine="streaming")
@@ -169,7 +166,7 @@ def field_text(path: Path, form: Format, source: Source, row: int, role: str) ->
     return cut(name), got
 
 
-def _raw(path: Path, form: Format, source: Source) -> _Raw:
+def _raw(path: Path, form: Format) -> _Raw:
     """Return the columns of a file and `ROW`."""
     try:
         if path.is_dir():
@@ -185,9 +182,8 @@ def _raw(path: Path, form: Format, source: Source) -> _Raw:
             return _Raw(frame, frame.select(pl.len()).collect().item())
         if kind.endswith(".xml"):
             return _Raw(_from(lambda: _xml(path, form)), size // BYTES)
-        if form.lists:
-            scalars = {"_id", "direction", *source.where}
-            return _Raw(_from(lambda: _json(path, form, scalars)), size // BYTES)
+        if kind.endswith(".json"):
+            return _Raw(_json(path, form), size // BYTES)
         return _text(path, form)
     except (OSError, EOFError, zlib.error, csv.Error) as problem:
         reason = cut(getattr(problem, "strerror", None) or problem)
@@ -409,78 +405,32 @@ def _xml(path: Path, form: Format) -> Iterator[pl.DataFrame]:
         ) from broken
 
 
-def _documents(path: Path) -> Iterator[Any]:
-    """Yield the documents of a JSON array, one in memory at a time."""
-    decoder, row = json.JSONDecoder(), 0
-    with _open(path) as binary:
-        file = io.TextIOWrapper(binary, encoding="utf-8-sig")
-        try:
-            text, place = file.read(BLOCK).lstrip(), 1
-            if not text.startswith("["):
-                return
-            while True:
-                while text[place : place + 1] in tuple(" \t\r\n,"):
-                    place += 1
-                if text[place : place + 1] == "]":
-                    return
-                try:
-                    document, place = decoder.raw_decode(text, place)
-                except json.JSONDecodeError:
-                    more = file.read(BLOCK) if len(text) - place < LONGEST_DOCUMENT else ""
-                    if not more:
-                        raise
-                    text, place = text[place:] + more, 0
-                    continue
-                yield document
-                row += 1
-        except (ValueError, RecursionError, EOFError, OSError, zlib.error) as broken:
-            raise TrajectoryError(
-                f"{path}, row {row + 1}: it is no complete JSON array: {cut(broken)}"
-            ) from broken
-
-
-def _json(path: Path, form: Format, scalars: Iterable[str]) -> Iterator[pl.DataFrame]:
-    """Read the points of a JSON array with a document for each vehicle; a row is a document."""
-    waiting: list[list[Any]] = []
-    scalars, row, n_waiting = tuple(scalars), 0, 0
-    kinds: dict[str, Any] = {ROW: pl.Int64, **dict.fromkeys(scalars, pl.String)}
-    kinds |= dict.fromkeys(form.lists, pl.List(pl.Float64))
-
-    def frame() -> pl.DataFrame:
-        columns = [*zip(*waiting, strict=True)] or [()] * len(kinds)
-        return pl.DataFrame(dict(zip(kinds, columns, strict=True)), kinds).explode(form.lists)
-
-    for row, document in enumerate(_documents(path), start=1):
-        where = f"{path}, row {row}"
-        if not isinstance(document, Mapping):
-            raise TrajectoryError(f"{where}: a document must be an object, got {shown(document)}")
-        missing = [name for name in (*form.lists, *scalars) if name not in document]
-        if missing:
-            raise TrajectoryError(
-                f"{where}: fields {', '.join(missing)} are missing, found {shown([*document])}"
-            )
-        texts = (document[name] for name in scalars)
-        names = [
-            str(each.get("$oid", each) if isinstance(each, Mapping) else each) for each in texts
+def _json(path: Path, form: Format) -> pl.LazyFrame:
+    """Return the points of a JSON array with a document for each vehicle; a row is a document."""
+    with _open(path) as file:
+        content = file.read(LARGEST_JSON + 1)
+    if len(content) > LARGEST_JSON:
+        raise TrajectoryError(
+            f"{path}: JSON must have at most {LARGEST_JSON} bytes, got more: give larger data as "
+            "Parquet or CSV, with the same columns and a row for each point"
+        )
+    try:
+        documents = pl.read_json(content, infer_schema_length=None)
+        lists = [name for name in form.lists if name in documents.columns]
+        # MongoDB's {"$oid": "..."} is its text; what else is nested is nothing of a point.
+        columns = [
+            pl.col(name).struct[0].alias(name) if isinstance(kind, pl.Struct) else pl.col(name)
+            for name, kind in documents.schema.items()
+            if name in lists or not kind.is_nested() or isinstance(kind, pl.Struct)
         ]
-        try:
-            lists = [np.array(document[name], dtype=float) for name in form.lists]
-        except (TypeError, ValueError, OverflowError) as problem:
-            raise TrajectoryError(
-                f"{where}: {', '.join(form.lists)} must be lists of numbers: {cut(problem)}"
-            ) from problem
-        shapes = {each.shape for each in lists}
-        if len(shapes) > 1 or lists[0].ndim != 1:
-            raise TrajectoryError(f"{where}: lists must be of one length, got shapes {shapes}")
-        if len(lists[0]):
-            waiting.append([row, *names, *lists])
-            n_waiting += len(lists[0])
-        if n_waiting >= CHUNK:
-            yield frame()
-            waiting, n_waiting = [], 0
-    if not row:
-        raise TrajectoryError(f"{path}: it must be a JSON array of documents, got none")
-    yield frame()
+        documents = documents.select(columns).with_row_index(ROW, 1)
+        for name in lists[:1]:
+            documents = documents.filter(pl.col(name).list.len() > 0).explode(lists)
+        return documents.lazy()
+    except pl.exceptions.PolarsError as broken:
+        what = "a complete array of documents, with lists of one length"
+        reason = cut(str(broken).partition("\n")[0])
+        raise TrajectoryError(f"{path}: JSON must be {what}: {reason}") from broken
 
 
 # -- formats ---------------------------------------------------------------------------------------

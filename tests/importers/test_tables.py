@@ -174,12 +174,22 @@ def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expect
     np.testing.assert_array_equal(counts(run(path, west)), expected)
 
 
-def test_a_document_that_is_too_long_is_not_read_to_its_end(tmp_path, monkeypatch):
+def test_i24_may_be_a_table_with_a_row_for_each_point(tmp_path, expected):
+    documents = i24(stream())
+    table = pl.DataFrame(
+        {name: [each[name] for each in documents] for name in (*LISTS, "direction")}
+        | {"_id": [each["_id"]["$oid"] for each in documents]}
+    ).explode(LISTS)
+    table.write_parquet(tmp_path / "i24.parquet")
+    imported = run(tmp_path / "i24.parquet", Source("i24", layout=Layout(origin=310000.0)))
+    np.testing.assert_array_equal(counts(imported), expected)
+
+
+def test_larger_json_is_asked_for_in_another_format(tmp_path, monkeypatch):
     path = tmp_path / "i24.json"
     path.write_text(json.dumps(i24(stream())))
-    monkeypatch.setattr("dptse_env.importers.tables.BLOCK", 8)
-    monkeypatch.setattr("dptse_env.importers.tables.LONGEST_DOCUMENT", 16)
-    with pytest.raises(TrajectoryError, match="row 1: it is no complete JSON array"):
+    monkeypatch.setattr("dptse_env.importers.tables.LARGEST_JSON", 1000)
+    with pytest.raises(TrajectoryError, match=r"at most 1000 bytes, got more: .* Parquet or CSV"):
         run(path, Source("i24", layout=Layout(origin=310000.0)))
 
 
@@ -257,13 +267,18 @@ BAD = {
     "a.csv.gz": [("not compressed", "the file cannot be read: Not a gzipped file")],
     "a.parquet": [("PAR1 and no more", "it is no complete Parquet file")],
     "a.json": [
-        (json.dumps(i24(stream()))[:-2000], "row 34: it is no complete JSON array"),
-        ("[" * 100_000, "row 1: it is no complete JSON array"),
-        ("[]", "must be a JSON array of documents, got none"),
+        (json.dumps(i24(stream()))[:-2000], "JSON must be a complete array of documents, .*Syntax"),
+        ("[" * 100_000, "JSON must be a complete array of documents"),
+        ("[]", r"columns must be timestamp, _id, x_position among others, found \[\]"),
         (json.dumps([{**dict.fromkeys(LISTS, ()), "_id": 1, "direction": 1}]), "got none"),
-        ("[3]", "row 1: a document must be an object, got 3"),
-        ('[{"_id": 1}]', "row 1: fields timestamp, x_position, y_position, .* are missing"),
-        (json.dumps([{**DOCUMENT, "x_position": [1.0]}]), "row 1: lists must"),
+        ("[3]", "JSON must be a complete array of documents"),
+        ('[{"_id": 1}]', r"columns must be timestamp, x_position among others, found \['_id'\]"),
+        (json.dumps([{**DOCUMENT, "x_position": [1.0]}]), "with lists of one length"),
+        (json.dumps([{**DOCUMENT, "x_position": 1.0}]), "with lists of one length"),
+        (
+            json.dumps([{**DOCUMENT, "x_position": ["a"] * len(DOCUMENT["x_position"])}]),
+            "row 1: x_position must be a finite number, got 'a'",
+        ),
         (None, "the file cannot be read: No such file"),
     ],
     "..": [(None, "must be a file, got a directory")],
