@@ -124,7 +124,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | :--                  | :--             | :--                                                 |
     | `corridor`           | "paper-highway" | the road: a name, a mapping or a road file          |
     | `estimator`          | "ekf"           | or `ukf`, `enkf`, `mhe`, `recurrent`, ...           |
-    | `backend`            | "compiled"      | or `reference`: textbook versions of the filters    |
+    | `backend`            | "compiled"      | or `reference`: textbook filters, an extra          |
     | `parameters`         | "paper"         | of the traffic model: a name, a mapping, a file     |
     | `estimator_settings` | None            | tuning of the estimator; None for what ships        |
     | `bandwidth`          | 5               | largest cost of the queries of a step               |
@@ -202,7 +202,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
 
         Raises:
             ValueError: A key is unknown or a value out of range; the message names it.
-            MissingExtraError: ``render_mode`` is ``"human"`` and pygame is not installed.
+            MissingExtraError: ``render_mode`` is ``"human"`` and pygame is not installed, or
+                ``backend`` is ``"reference"`` and its filters are not.
 
         Warns:
             UserWarning: A release model with a guarantee is configured, and other keywords void

@@ -217,7 +217,7 @@ def test_values_that_are_nested_deeply_are_refused_by_their_path():
     for _ in range(100_000):
         deep = [deep]
     values = dict.fromkeys(field_hints(EnvConfig), deep) | {
-        "estimator_settings": {"mhe": {"solver": deep}},
+        "estimator_settings": {"mhe": {"linearisation": deep}},
         "privacy": {"preset": deep},
         "corridor": {"demand": {"mainline": deep}},
         "render_every": deep,

@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-import qpsolvers
 from scipy import stats
 
 from dptse_env.config import resolve
@@ -13,7 +12,7 @@ from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from tests.helpers import COUNTED, PAID, fast_and_slow
 
-from .estimators.test_mhe import missing, unsolved
+from .estimators.test_mhe import make_unsolvable
 
 SEEDS = (11, 12, 13)
 ALL = np.arange(3)
@@ -206,8 +205,7 @@ def test_an_update_that_is_not_solved_is_said_of_its_episode(monkeypatch):
     process, nobody = begun(2, estimator="mhe"), np.zeros((2, 6), dtype=np.int8)
     for _ in range(12):
         process.step(ALL[:2], nobody)
-    monkeypatch.setattr(qpsolvers, "solve_problem", missing)
-    monkeypatch.setattr("dptse_env.estimators.mhe.update", unsolved)
+    make_unsolvable(process.estimator, monkeypatch)
     outcome = process.step(ALL[:1], nobody[:1])
     assert [process.info(e)["fallback"] for e in range(2)] == [1.0, 0.0]
     assert process.info(0)["diverged"] == 0.0

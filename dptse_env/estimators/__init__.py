@@ -154,6 +154,7 @@ def make_estimator(
         settings: Settings; None for the defaults.
 
     Raises:
+        MissingExtraError: The backend is `reference` and its libraries are not installed.
         ValueError: Name or backend is unknown, the estimator does not have the backend, there are
             no episodes, a setting is out of range on this road, or the estimator lacks a method or
             an attribute.

@@ -2,18 +2,15 @@
 
 A window holds L = T + 1 stages; z stacks their normalised states, rho by rho_m and psi by
 rho_m v_f; a demand factor is a number without a unit. Its program is the paper's eq. 17,
-`minimise z' H z + q' z with lower <= z <= upper`. The reference shares its bounds, weights and
-general solver, which are at the end.
+`minimise z' H z + q' z with lower <= z <= upper`. The reference shares its bounds and weights,
+which are at the end.
 """
 
 import math
-import warnings
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from dptse_env.estimators import ekf
 from dptse_env.estimators.base import Measurement
@@ -21,7 +18,6 @@ from dptse_env.estimators.ekf import CovarianceFilter, Filters, initial_variance
 from dptse_env.estimators.linalg import move, padded
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.window import (
-    AT_BOUND,
     UNSOLVED,
     Window,
     factorise,
@@ -52,17 +48,8 @@ from dptse_env.utils.kernels import (
     kernel_part,
 )
 
-# Largest natural residual of an optimum, in normalised states.
-RESIDUAL = 1e-8
-# Solutions with a larger residual are not inaccurate optima, but wrong. The largest one of piqp is
-# 4e-5, and 2e-2 where measurements are treated as exact.
-ROUGH = 0.05
-# Number of polishing steps; a second step mostly corrects what the first one missed.
-POLISHES = 10
 # Least deviation of a measurement, normalised: an exact one would have an infinite weight.
 LEAST_DEVIATION = 1e-3
-
-GENERAL_SOLVER, FALLBACK = 3, 4  # how a program was solved, beside those of `window`
 
 MOST_VARIABLES = 3000
 """Variables of the longest window.
@@ -95,7 +82,8 @@ class Windows(NamedTuple):
     solution: FloatArray  # (n, L, padded)
     side: IntArray  # (n, L, padded) bounds that the last solution is at, -1, 0 or 1
     point: FloatArray  # (n, padded) where the last stage is linearised, unless along the solution
-    solved: IntArray  # (n,) how the last program was solved; 0 for none, or not yet
+    solved: IntArray  # (n,) how the last program was solved; `UNSOLVED` where there was none too
+    fallback: BoolArray  # (n,) whether the last program was not solved, so the prediction stays
     moving_variance: FloatArray  # (n_x,) arrival variance of a window that moves
     lower: FloatArray  # (n_x,)
     upper: FloatArray  # (n_x,)
@@ -232,7 +220,7 @@ def update(
     sigma: FloatArray,
     centre: FloatArray,
 ) -> None:
-    """Update by measurements, `sigma` no less than allowed; see `Estimator.update`."""
+    """Update by measurements; see `Estimator.update`."""
     road, filters, windows = bundle.parts
     n, width = windows.units.size, windows.solution.shape[2]
     n_stages = windows.solution.shape[1] - 1
@@ -244,7 +232,7 @@ def update(
         last = windows.length[e] - 1
         copy_vector(observed[k], windows.observed[e, last])
         copy_vector(centre[k], windows.centre[e, last])
-        windows.solved[e] = UNSOLVED
+        windows.solved[e], windows.fallback[e] = UNSOLVED, False
         sound = _measure(road, filters, windows, e, values[k], sigma[k])
         window, factor.length[0] = window_of(windows, e), 0
         side, z = windows.side[e, : last + 1], windows.solution[e, : last + 1].copy()
@@ -256,8 +244,11 @@ def update(
                 sound = sound and all_finite(filters.covariances[e, i])
         if sound and any_of(observed[k]):
             windows.solved[e] = minimise(road, window, factor, side, z)
-            if windows.solved[e] != UNSOLVED:
-                accept(bundle, e, z)
+            if windows.solved[e] == UNSOLVED:
+                windows.fallback[e] = True
+                windows.side[e] = 0
+            else:
+                _accept(road, filters, windows, e, z)
         filters.diverged[e] = not sound
         if not sound:
             restart(bundle, e)
@@ -282,7 +273,8 @@ def _measure(
             unit = filters.units[0] if q == 0 else road.second_scale
             value = values[m, q] / unit if windows.observed[e, last, m] else 0.0
             windows.values[e, last, m, q] = value
-            windows.noise[e, last, m, q] = (sigma[m, q] / unit) ** 2
+            deviation = max(sigma[m, q], LEAST_DEVIATION * unit) / unit
+            windows.noise[e, last, m, q] = deviation**2
             sound = sound and math.isfinite(value)
         for s in range(first, first + span):
             density += mean[2 * s]
@@ -325,10 +317,9 @@ def _innovate(
             filters.innovations[e, m, q] = gap / deviation
 
 
-@kernel
-def accept(bundle: Bundle, e: int, z: FloatArray) -> None:
-    """Accept a solution `(>= L, padded)`, whose last state is the estimate."""
-    road, filters, windows = bundle.parts
+@kernel_part
+def _accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: FloatArray) -> None:
+    """Accept a solution `(L, padded)`, whose last state is the estimate."""
     for t in range(windows.length[e]):
         for i in range(windows.units.size):
             windows.solution[e, t, i] = z[t, i]
@@ -379,15 +370,15 @@ def write_program(bundle: Bundle, e: int, H: FloatArray, q: FloatArray) -> None:
 class MHE(CovarianceFilter):
     """Moving horizon estimation (paper, eq. 14 to 17).
 
-    The program is solved exactly by `window.minimise`, started from the last step's solution, where
-    that finds no optimum by a general solver, and where that fails the prediction stays. Deviations
-    are those of the last state given the window, without bounds.
+    The program is solved exactly by `window.minimise`, started from the last step's solution.
+    Where that finds no optimum, the prediction stays and `fallback` says so. Deviations are those
+    of the last state given the window, without bounds.
     """
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings_of_mhe(settings))
-        self._windows = _allocate(model, n_episodes, settings)
+        self._windows = _allocate(model, settings, self.fallback)
         self._all = Bundle(model.road, self.filters, self._windows)
         self._restart(np.arange(n_episodes))
 
@@ -403,7 +394,7 @@ class MHE(CovarianceFilter):
     def solved(self) -> IntArray:
         """The way in which each episode's last program was solved `(n,)`, a copy.
 
-        `UNSOLVED` where there was none, `ACTIVE_SET`, `NEWTON`, `GENERAL_SOLVER` or `FALLBACK`.
+        `ACTIVE_SET`, `NEWTON`, or `UNSOLVED` where neither found an optimum or nothing was seen.
         """
         return self._windows.solved.copy()
 
@@ -421,33 +412,17 @@ class MHE(CovarianceFilter):
         predict(self._all, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        least = LEAST_DEVIATION * self.model.measurement_scale
         observed, values, sigma, centre = measured
-        self.fallback[episodes] = False
-        update(self._all, episodes, observed, values, np.maximum(sigma, least), centre)
-        unsolved = self._windows.solved[episodes] == UNSOLVED
-        unsolved &= observed.any(axis=1) & ~self.diverged[episodes]
-        for episode in episodes[unsolved].tolist():
-            self._pass_on(episode)
-
-    def _pass_on(self, episode: int) -> None:
-        """Pass a program that remains unsolved on to a general solver."""
-        windows, length = self._windows, int(self._windows.length[episode])
-        lower, upper = np.tile(windows.lower, length), np.tile(windows.upper, length)
-        z = solve(*self.program(episode), lower, upper, self.settings.mhe.solver)
-        self.fallback[episode], windows.side[episode] = z is None, 0
-        windows.solved[episode] = FALLBACK if z is None else GENERAL_SOLVER
-        if z is not None:
-            accept(self._all, episode, z.reshape(length, -1))
+        update(self._all, episodes, observed, values, sigma, centre)
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():
             restart(self._all, episode)
 
 
-def _allocate(model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> Windows:
-    """Return empty windows."""
-    n, s, n_rows = model.n_states, model.n_segments, model.rows.n_rows
+def _allocate(model: ARZModel, settings: EstimatorSettings, fallback: BoolArray) -> Windows:
+    """Return empty windows of n episodes, which write to `fallback` `(n,)`."""
+    n, s, n_rows, n_episodes = model.n_states, model.n_segments, model.rows.n_rows, fallback.size
     width, shape = padded(n), (n_episodes, settings.mhe.horizon + 2)
     lower, upper = normalised_bounds(model, settings.mhe.bounds)
     return Windows(
@@ -469,6 +444,7 @@ def _allocate(model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> 
         side=np.zeros((*shape, width), dtype=np.int64),
         point=np.zeros((n_episodes, width)),
         solved=np.zeros(n_episodes, dtype=np.int64),
+        fallback=fallback,
         moving_variance=moving_variance(model, settings),
         lower=lower,
         upper=upper,
@@ -494,21 +470,7 @@ def moving_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
 
 
 def settings_of_mhe(settings: EstimatorSettings) -> EstimatorSettings:
-    """Return the settings with the bounds of the MHE, which differ from those of other estimators.
-
-    Warns:
-        RuntimeWarning: The solver is not installed; steps that need it keep the prediction.
-    """
-    import qpsolvers  # noqa: PLC0415
-
-    solver, installed = settings.mhe.solver, qpsolvers.available_solvers
-    if solver not in installed:
-        warnings.warn(
-            f"estimator_settings.mhe.solver {solver!r} is not installed: steps that need it keep "
-            f"the prediction and set info['fallback']; installed: {', '.join(installed)}",
-            RuntimeWarning,
-            stacklevel=2,
-        )
+    """Return the settings with the bounds of the MHE, which are separate from other estimators'."""
     return replace(settings, bounds=settings.mhe.bounds)
 
 
@@ -524,64 +486,3 @@ def normalised_bounds(model: ARZModel, bounds: Bounds) -> tuple[FloatArray, Floa
         np.concatenate([lower, LEAST_FACTOR * factors]),
         np.concatenate([upper, LARGEST_FACTOR * factors]),
     )
-
-
-def natural_residual(
-    H: FloatArray, q: FloatArray, lower: FloatArray, upper: FloatArray, z: FloatArray
-) -> float:
-    """Largest |z - clip(z - g / diag(2 H), lower, upper)|, g = 2 H z + q; 0 at the optimum only.
-
-    The gradient is scaled by the diagonal, so that the residual is in units of z for any weights.
-    It is NaN where z is.
-    """
-    step = (2.0 * H @ z + q) / (2.0 * np.diag(H))
-    return float(np.max(np.abs(z - np.clip(z - step, lower, upper))))
-
-
-def solve(
-    H: FloatArray, q: FloatArray, lower: FloatArray, upper: FloatArray, solver: str
-) -> FloatArray | None:
-    """Minimise z' H z + q' z within bounds by qpsolvers; None where it finds no optimum.
-
-    An interior point method stops short of the bounds, so its solution is polished several times:
-    components that are nearly at a bound and pressed against it are set to it, and the others are
-    solved for. The best solution is returned. The `natural_residual`, not the solver's status,
-    decides whether a solution is worth polishing and whether the result is an optimum.
-    """
-    import qpsolvers  # noqa: PLC0415  (rarely needed)
-
-    P = sp.csc_matrix(2.0 * H)  # qpsolvers minimises z' P z / 2 + q' z
-    problem = qpsolvers.Problem(P, q, lb=lower, ub=upper)
-    options: dict[str, Any] = {"eps_abs": 1e-9, "eps_rel": 1e-9} if solver == "piqp" else {}
-    try:
-        z = qpsolvers.solve_problem(problem, solver=solver, **options).x
-    except (qpsolvers.SolverNotFound, qpsolvers.SolverError):
-        return None
-    if z is None:
-        return None
-    best = z = np.clip(z, lower, upper)
-    if not natural_residual(H, q, lower, upper, z) <= ROUGH:  # a NaN is no optimum either
-        return None
-    for _ in range(POLISHES):
-        try:
-            z = _polish(P, q, lower, upper, z)
-        except RuntimeError:  # splu: the matrix is singular
-            break
-        pair = best, np.clip(z, lower, upper)
-        best = min(pair, key=lambda z: natural_residual(H, q, lower, upper, z))
-    best = np.where(best < lower + AT_BOUND, lower, np.where(best > upper - AT_BOUND, upper, best))
-    return best if natural_residual(H, q, lower, upper, best) <= RESIDUAL else None
-
-
-def _polish(
-    P: sp.csc_matrix, q: FloatArray, lower: FloatArray, upper: FloatArray, z: FloatArray
-) -> FloatArray:
-    """Set variables that are pressed against a bound to it, and solve for the others."""
-    step = (P @ z + q) / P.diagonal()
-    at_lower, at_upper = z - lower <= step, upper - z <= -step
-    free = ~(at_lower | at_upper)
-    exact: FloatArray = np.where(at_lower, lower, np.where(at_upper, upper, 0.0))
-    factors = splu(P[free][:, free].tocsc())
-    for _ in range(2):  # the second pass corrects rounding errors
-        exact[free] += factors.solve(-(q + P @ exact)[free])
-    return exact

@@ -27,9 +27,6 @@ from dptse_env.utils.fields import (
 
 Linearisation = Literal["paper", "trajectory"]
 
-# Solvers of qpsolvers that report false optima of these programs as found.
-REFUSED_SOLVERS = ("highs",)
-
 _PATH = "estimator_settings"
 _KEYS = {"estimator": str, "settings": dict, "provenance": dict}
 
@@ -113,23 +110,12 @@ class HorizonSettings(_Checked, path=f"{_PATH}.mhe"):
             solution; `trajectory`: all stages at every step along the last solution.
         bounds: `box`, the paper's, or `cone`: the smallest box around the cone of physical states
             bounds the program, and its last state is projected into the cone.
-        solver: Name of a solver of qpsolvers.
     """
 
     horizon: Annotated[int, Interval(1, 1000)] = 10
     arrival_noise: tuple[ArrivalDeviation, ArrivalDeviation] = (0.03, 0.03)
     linearisation: Linearisation = "paper"
     bounds: Bounds = "box"
-    solver: str = "piqp"
-
-    def __post_init__(self) -> None:
-        """Check values; lists become tuples."""
-        super().__post_init__()
-        if self.solver in REFUSED_SOLVERS:
-            raise ValueError(
-                f"{_PATH}.mhe.solver must not be {self.solver!r}, which reports false optima of "
-                "these programs as found; use 'piqp'"
-            )
 
 
 @dataclass(frozen=True)

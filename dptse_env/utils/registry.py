@@ -205,6 +205,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
         "torch", "tyro",
     ),
     "corridors": ("polars", "sumo"),
+    "reference": ("filterpy", "piqp", "qpsolvers"),
     "ray": ("ray",),
     "video": ("moviepy", "pygame"),
 }  # fmt: skip

@@ -44,7 +44,6 @@ FILE = {"mhe-paper-corrected": ENTRY}
         ("walk_noise", (float("nan"), 0.0), r"walk_noise\[0\] must be .*, got nan"),
         ("bounds", "ball", r"bounds must be one of 'cone', 'box', got 'ball'"),
         ("mhe", {"arrival_noise": [0.1, 0.0]}, r"mhe\.arrival_noise\[1\] must be .*, got 0\.0"),
-        ("mhe", {"solver": "highs"}, r"mhe\.solver must not be 'highs'"),  # finds false optima
         ("enkf", {"n_member": 50}, r"enkf\.n_member is unknown; allowed: n_members"),
     ],
 )
@@ -64,7 +63,7 @@ def test_settings_survive_json():
         demand=DemandSettings(walk=0.1),
         ukf=SigmaPointSettings(alpha=0.5),
         enkf=EnsembleSettings(inflation=1.1, taper=2.0),
-        mhe=HorizonSettings(horizon=4, arrival_noise=(0.1, 0.2), solver="quadprog"),
+        mhe=HorizonSettings(horizon=4, arrival_noise=(0.1, 0.2)),
         blend=BlendSettings(density_weight=0.3, speed_weight=0.9),
     )
     again = EstimatorSettings(**json.loads(json.dumps(asdict(settings))))
