@@ -21,7 +21,7 @@ from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Obse
 from dptse_env.utils.fields import shown
 from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.threads import EpisodeThreads
-from dptse_env.utils.vector_info import Rows, row_of
+from dptse_env.utils.vector_info import Infos, info_of
 
 TRUTH_INFO = ("rmse_density", "rmse_speed", "n_occupied", "traffic_seed", "truth")
 """Keys of ``info`` that come from the true traffic, or name its record; the others are public."""
@@ -253,7 +253,7 @@ class QueryProcess:
         return self.estimator.estimate().at(episodes)
 
     def _estimated(self, episodes: IntArray) -> Estimate:
-        """Store the estimator's present output; return the rows of ``episodes``."""
+        """Store the estimator's present output; return that of ``episodes``."""
         self.estimate = self.estimator.estimate()
         if self._checks_estimates:
             check_estimate(self.estimator, self.estimate, self.model.n_segments)
@@ -316,17 +316,17 @@ class QueryProcess:
 
     def info(self, episode: int) -> dict[str, Any]:
         """Return the info of one episode, in plain numbers."""
-        return row_of(self.infos(np.array([episode])), 0)
+        return info_of(self.infos(np.array([episode])), 0)
 
-    def infos(self, episodes: IntArray) -> Rows:
-        """Return the infos of ``episodes``, shape (k,): fresh arrays of k rows each.
+    def infos(self, episodes: IntArray) -> Infos:
+        """Return the infos of ``episodes``, shape (k,): fresh arrays.
 
         The keys in `TRUTH_INFO` come from the true traffic, or name its record. They serve training
         and evaluation, as the reward does, and are not covered by the guarantee. The others are
         public.
         """
         mu, epsilon = self.release.spent(episodes, self.elapsed[episodes])
-        infos: Rows = {
+        infos: Infos = {
             "rmse_density": self.error.density[episodes],
             "rmse_speed": self.error.speed[episodes],
             "n_occupied": self.error.n_occupied[episodes].astype(np.float64),
@@ -343,7 +343,7 @@ class QueryProcess:
             infos["truth"] = self._truth_infos(episodes)
         return infos
 
-    def _truth_infos(self, episodes: IntArray) -> Rows:
+    def _truth_infos(self, episodes: IntArray) -> Infos:
         truth, traffic = self.truth(episodes), self.traffic_index[episodes]
         return {
             "density": truth[:, :, 0].copy(),

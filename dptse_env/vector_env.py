@@ -20,7 +20,7 @@ from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.fields import integer, require_name
-from dptse_env.utils.vector_info import Rows, in_vector_form, object_array, repeated_rows
+from dptse_env.utils.vector_info import Infos, in_vector_form, object_array, repeated_infos
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
 
@@ -32,12 +32,12 @@ class FinalStates:
     Attributes:
         episodes: Their indices, shape (k,).
         observation: Their last observations, shape (k, size).
-        infos: Their last infos, as rows of `dptse_env.utils.vector_info`.
+        infos: Their last infos, see `dptse_env.utils.vector_info`.
     """
 
     episodes: IntArray
     observation: Observation
-    infos: Rows
+    infos: Infos
 
 
 @dataclass(frozen=True)
@@ -188,9 +188,9 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         infos = self._infos(self._all, np.flatnonzero(transition.was_reset))
         final = transition.final
         if final is not None:
-            rows: Rows = {"final_obs": object_array(list(final.observation))}
-            rows["final_info"] = final.infos
-            infos |= in_vector_form(rows, final.episodes, self.num_envs)
+            ended: Infos = {"final_obs": object_array(list(final.observation))}
+            ended["final_info"] = final.infos
+            infos |= in_vector_form(ended, final.episodes, self.num_envs)
         return (
             transition.observation,
             transition.reward,
@@ -262,8 +262,8 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         """Return the infos of ``episodes``, and the reset infos of those in ``reset``."""
         infos = in_vector_form(self.process.infos(episodes), episodes, self.num_envs)
         if reset.size:
-            rows = repeated_rows(self.process.reset_info(), len(reset))
-            infos |= in_vector_form(rows, reset, self.num_envs)
+            at_reset = repeated_infos(self.process.reset_info(), len(reset))
+            infos |= in_vector_form(at_reset, reset, self.num_envs)
         return infos
 
     def _generator(self, episode: int) -> tuple[np.random.Generator, int]:

@@ -28,7 +28,7 @@ from dptse_env.traffic import Corridor, Penetration
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval, checked_fields, require
 from dptse_env.utils.registry import name_of_class
-from dptse_env.utils.vector_info import Rows
+from dptse_env.utils.vector_info import Infos
 
 BoundaryInputs = Literal["true", "nominal", "private"]
 """Source of the estimator's inputs at the boundary: measured traffic, public demand, or the
@@ -443,7 +443,7 @@ class ReleaseModel(ABC):
             noise=settings.noise,
         )
 
-    def public(self, episodes: IntArray) -> Rows:
+    def public(self, episodes: IntArray) -> Infos:
         """Return further public numbers for ``info``, rows of k episodes; by default none.
 
         Where queries have prices, ``prices`` (k, G) and ``tracer`` (k, n_mainline) are among them,
@@ -451,7 +451,7 @@ class ReleaseModel(ABC):
         """
         return {}
 
-    def private(self, episodes: IntArray, traffic: IntArray) -> Rows:
+    def private(self, episodes: IntArray, traffic: IntArray) -> Infos:
         """Return private data for ``info["truth"]`` alone, rows of k episodes; by default none."""
         return {}
 

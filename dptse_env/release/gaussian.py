@@ -38,7 +38,7 @@ from dptse_env.release.vehicles import Ledgers, Traffic, require_exact_sums
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.fields import Interval
-from dptse_env.utils.vector_info import Rows, object_array
+from dptse_env.utils.vector_info import Infos, object_array
 
 Unit = Literal["trip", "event"]
 """Unit of protection: a trip with capped contributions, or a second of it."""
@@ -381,7 +381,7 @@ class Capped(GaussianRelease):
         spent: FloatArray = counted / cap if cap else np.zeros(len(episodes))
         return spent
 
-    def private(self, episodes: IntArray, traffic: IntArray) -> Rows:
+    def private(self, episodes: IntArray, traffic: IntArray) -> Infos:
         """Return each vehicle's contributions, and the epsilon that it has spent.
 
         Lists, since records differ in their number of vehicles and Gymnasium stacks arrays of equal
@@ -392,8 +392,8 @@ class Capped(GaussianRelease):
         # A vehicle that has counted k times has spent the budget of a cap of k.
         cap = self.task.settings.contributions(self.task.horizon)
         spent = [self._account.epsilons(self.mu**2 @ steps / cap) for steps in counted]
-        rows: Rows = {
+        infos: Infos = {
             f"{prefix}exposures": object_array([steps[g].astype(int).tolist() for steps in counted])
             for g, prefix in zip(range(len(self.task.groups)), ("", "sensor_"), strict=False)
         }
-        return {**rows, "individual_epsilon": object_array(spent)}
+        return {**infos, "individual_epsilon": object_array(spent)}

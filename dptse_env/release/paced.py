@@ -37,7 +37,7 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval
 from dptse_env.utils.kernels import Bundle, kernel
 from dptse_env.utils.registry import is_foreign
-from dptse_env.utils.vector_info import Rows, object_array
+from dptse_env.utils.vector_info import Infos, object_array
 
 PacedUnit = Literal["trip", "event"]
 """Unit of protection of the paced ledger: a complete trip, or a second of it."""
@@ -264,7 +264,7 @@ class Paced(ReleaseModel):
             },
         )
 
-    def public(self, episodes: IntArray) -> Rows:
+    def public(self, episodes: IntArray) -> Infos:
         """Return prices and tracer of the queries, and whether no prediction was finite.
 
         Prices (k, G) are those of the last second, 0 at first; the tracer is of shape
@@ -284,7 +284,7 @@ class Paced(ReleaseModel):
         spent: FloatArray = paid / self.budget.sum()
         return spent
 
-    def private(self, episodes: IntArray, traffic: IntArray) -> Rows:
+    def private(self, episodes: IntArray, traffic: IntArray) -> Infos:
         """Return what each vehicle has paid over its budget, its epsilon, and refusals.
 
         The first two are lists, since records differ in their number of vehicles and Gymnasium
@@ -292,12 +292,12 @@ class Paced(ReleaseModel):
         group of columns are ``sensor_ledgers``.
         """
         paid = self.ledgers.of(episodes, self.traffic.n_vehicles[traffic])
-        rows: Rows = {
+        infos: Infos = {
             f"{prefix}ledgers": object_array([(each[g] / self.budget[g]).tolist() for each in paid])
             for g, prefix in zip(range(self.budget.size), ("", "sensor_"), strict=False)
         }
         return {
-            **rows,
+            **infos,
             "individual_epsilon": object_array([self._losses(p.T)[1].tolist() for p in paid]),
             "n_refused": self._refused[episodes].sum(axis=1),
         }

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from dptse_env.config import EnvConfig
 from dptse_env.utils.arrays import Action, Observation
 from dptse_env.utils.fields import integer
-from dptse_env.utils.vector_info import row_of
+from dptse_env.utils.vector_info import info_of
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 _MASKS = "action_masks"
@@ -121,7 +121,7 @@ class SB3VecEnv(VecEnv):
         final = transition.final
         if final is not None:
             for k, episode in enumerate(final.episodes):
-                infos[episode].update(row_of(final.infos, k))
+                infos[episode].update(info_of(final.infos, k))
                 infos[episode]["terminal_observation"] = final.observation[k].copy()
                 infos[episode]["TimeLimit.truncated"] = True
             self._note_resets(final.episodes)
@@ -186,10 +186,10 @@ class SB3VecEnv(VecEnv):
 
     def _note_resets(self, episodes: Sequence[int] | NDArray[np.int64] | range) -> None:
         """Store the infos of resets where stable-baselines3 looks for them."""
-        rows = self.env.process.infos(np.asarray(episodes))
+        infos = self.env.process.infos(np.asarray(episodes))
         at_reset = self.env.process.reset_info()
         for k, episode in enumerate(episodes):
-            self.reset_infos[episode] = {**row_of(rows, k), **at_reset}
+            self.reset_infos[episode] = {**info_of(infos, k), **at_reset}
 
 
 def config_of(env: Any) -> EnvConfig:

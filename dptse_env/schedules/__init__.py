@@ -155,9 +155,9 @@ class Schedule(ABC):
         new_state = ScheduleState(step + last_pick, wanted)
         return (action[0] if np.ndim(observation) == 1 else action), new_state
 
-    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
-        """Return `select` for some ``rows`` of the batch; all arrays have these rows alone."""
-        del rows
+    def _choose(self, episodes: IntArray, step: IntArray, observation: Observation) -> BoolArray:
+        """Return `select` for some ``episodes`` of the batch; all arrays have these alone."""
+        del episodes
         return self.select(step, observation)
 
     def _resume(
@@ -260,7 +260,9 @@ class ProcessSchedule(Schedule):
         return self._choose(np.arange(self.process.n_episodes), step, observation)
 
     @abstractmethod
-    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray: ...
+    def _choose(
+        self, episodes: IntArray, step: IntArray, observation: Observation
+    ) -> BoolArray: ...
 
 
 def best_options(
@@ -281,17 +283,17 @@ def best_options(
     turn = (queries.first - step[:, None]) % queries.n_mainline
     other = queries.level != queries.standard_level
     order = np.lexsort((turn, -score, np.broadcast_to(other, score.shape)), axis=1)
-    chosen, rows = np.zeros(score.shape, dtype=bool), np.arange(len(score))
+    chosen, every = np.zeros(score.shape, dtype=bool), np.arange(len(score))
     left = np.full(len(score), queries.bandwidth)
     covered = np.zeros((len(score), queries.n_mainline), dtype=bool)
     for is_distinct in (True, False):
         for option in order.T:
             if (left < queries.cost.min()).all():
                 return chosen
-            fits = (queries.cost[option] <= left) & ~chosen[rows, option]
+            fits = (queries.cost[option] <= left) & ~chosen[every, option]
             if is_distinct:
                 fits &= ~other[option] & ~(covered & queries.covers[option]).any(axis=1)
-            chosen[rows, option] |= fits
+            chosen[every, option] |= fits
             covered |= queries.covers[option] & fits[:, None]
             left -= np.where(fits, queries.cost[option], 0)
     return chosen

@@ -117,29 +117,32 @@ class GreedyTrace(ProcessSchedule):
             speed_cap=self.speed_cap,
         )
 
-    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
+    def _choose(self, episodes: IntArray, step: IntArray, observation: Observation) -> BoolArray:
         process = self.process
-        self._begin(rows)
-        inputs = process.boundary.inputs(rows, process.traffic_index[rows], process.time[rows])
-        means = np.ascontiguousarray(self._estimator.states[rows, : self._before.shape[1]])
-        inputs, queried = np.ascontiguousarray(inputs), np.zeros((len(rows), self.n_mainline), bool)
-        choose(self._road, self._design, rows, means, inputs, self._before, self._after, queried)
+        self._begin(episodes)
+        traffic, times = process.traffic_index[episodes], process.time[episodes]
+        inputs = np.ascontiguousarray(process.boundary.inputs(episodes, traffic, times))
+        means = np.ascontiguousarray(self._estimator.states[episodes, : self._before.shape[1]])
+        queried = np.zeros((len(episodes), self.n_mainline), dtype=bool)
+        covariances = self._before, self._after
+        choose(self._road, self._design, episodes, means, inputs, *covariances, queried)
         return queried
 
-    def _begin(self, rows: IntArray) -> None:
+    def _begin(self, episodes: IntArray) -> None:
         """Let the covariances before the coming second be those after the last one.
 
         A repeated call in the same second starts from the same covariance; after a second without
         a call, as after a reset, the estimator's is the start.
         """
-        second = self.process.elapsed[rows]
-        is_next = second == self._second[rows] + 1
-        self._before[rows[is_next]] = self._after[rows[is_next]]
-        is_new = (second == 0) | ~(is_next | (second == self._second[rows]))
+        second = self.process.elapsed[episodes]
+        is_next = second == self._second[episodes] + 1
+        self._before[episodes[is_next]] = self._after[episodes[is_next]]
+        is_new = (second == 0) | ~(is_next | (second == self._second[episodes]))
         if is_new.any():
             n = self._before.shape[1]
-            self._before[rows[is_new], :, :n] = self._estimator.covariances[rows[is_new], :n, :n]
-        self._second[rows] = second
+            new = episodes[is_new]
+            self._before[new, :, :n] = self._estimator.covariances[new, :n, :n]
+        self._second[episodes] = second
 
 
 class Work(NamedTuple):

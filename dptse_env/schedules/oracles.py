@@ -23,11 +23,11 @@ class OracleError(ProcessSchedule):
     name: ClassVar[str] = "oracle-error"
     uses_truth: ClassVar[bool] = True
 
-    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
+    def _choose(self, episodes: IntArray, step: IntArray, observation: Observation) -> BoolArray:
         process, n = self.process, self.n_mainline
         corridor, term = process.config.corridor, self.interface.reward.term
-        truth, estimate = process.truth(rows)[:, :n], process.estimate.at(rows)
-        error = np.zeros((len(rows), n))
+        truth, estimate = process.truth(episodes)[:, :n], process.estimate.at(episodes)
+        error = np.zeros((len(episodes), n))
         if term != "speed":
             error += ((estimate.density[:, :n] - truth[..., 0]) / corridor.density_scale) ** 2
         if term != "density":
@@ -63,11 +63,12 @@ class OracleGain(ProcessSchedule):
                 f"{process.release.task.name!r}"
             )
 
-    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
-        value = np.zeros((len(rows), self.n_mainline))  # an episode that is over has no next second
-        live = ~self.process.over[rows]
+    def _choose(self, episodes: IntArray, step: IntArray, observation: Observation) -> BoolArray:
+        # An episode that is over has no next second.
+        value = np.zeros((len(episodes), self.n_mainline))
+        live = ~self.process.over[episodes]
         if live.any():
-            value[live] = self._rewards(rows[live])
+            value[live] = self._rewards(episodes[live])
         return self.first_that_fit(np.argsort(-value, axis=1, kind="stable"))
 
     def _rewards(self, episodes: IntArray) -> FloatArray:

@@ -223,7 +223,7 @@ class SpeedFront(Schedule):
         """See `Schedule.predict`; the state is a `FrontState`."""
         batch = np.atleast_2d(observation)
         surprise = self._surprise(batch, state, episode_start)
-        # `_choose` is called with some rows of the batch in the call below, and reads theirs here.
+        # The call below has `_choose` read those of some episodes here.
         self._present = surprise
         action, (step, wanted) = super().predict(
             observation, None if state is None else state[:2], episode_start, deterministic
@@ -250,8 +250,8 @@ class SpeedFront(Schedule):
         mixed: FloatArray = (1.0 - self.newest) * before + self.newest * mean
         return np.where(times > 0.0, mixed, before)
 
-    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
-        return self._highest_of(self._present[rows], step, observation)
+    def _choose(self, episodes: IntArray, step: IntArray, observation: Observation) -> BoolArray:
+        return self._highest_of(self._present[episodes], step, observation)
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`; as if no answer had surprised yet."""
@@ -299,17 +299,17 @@ class ExpectedReduction(ProcessSchedule):
         self._of_density = (term != "speed") / corridor.density_scale**2
         self._of_speed = (term != "density") / corridor.speed_scale**2
 
-    def _choose(self, rows: IntArray, step: IntArray, observation: Observation) -> BoolArray:
+    def _choose(self, episodes: IntArray, step: IntArray, observation: Observation) -> BoolArray:
         n, estimate = self.n_mainline, self.process.estimate
         density, density_std, speed_std = (
-            table[rows, :n]
+            table[episodes, :n]
             for table in (estimate.density, estimate.density_std, estimate.speed_std)
         )
         flows = self.process.model.reference_speed is not None
         carrier = np.maximum(density, LEAST_DENSITY) if flows else np.ones_like(density)
         value = self._of_density * _reduction(density_std**2, self._noise[0])
         value += self._of_speed * _reduction(speed_std**2, self._noise[1] / carrier**2)
-        return self.highest((self.process.age[rows] + 1.0) * value, step)
+        return self.highest((self.process.age[episodes] + 1.0) * value, step)
 
 
 def _reduction(variance: FloatArray, noise: FloatArray | float) -> FloatArray:

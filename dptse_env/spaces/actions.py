@@ -97,14 +97,14 @@ def first_that_fit(order: IntArray, costs: IntArray, limit: int) -> BoolArray:
         costs: Of the options, shape (n,).
         limit: What they may cost together.
     """
-    kept, rows = np.zeros(order.shape, dtype=bool), np.arange(len(order))
+    kept, every = np.zeros(order.shape, dtype=bool), np.arange(len(order))
     if (costs == costs[0]).all():
-        kept[rows[:, None], order[:, : limit // costs[0]]] = True
+        kept[every[:, None], order[:, : limit // costs[0]]] = True
         return kept
     left = np.full(len(order), limit)
     for option in order.T:
         fits = costs[option] <= left
-        kept[rows, option] = fits
+        kept[every, option] = fits
         left -= np.where(fits, costs[option], 0)
         if not left.any():
             break
@@ -165,7 +165,7 @@ class ActionEncoding(ABC):
         """Turn actions into options to query.
 
         Args:
-            episodes: The k episodes that act, rows of ``pending``.
+            episodes: The k episodes that act, indices into ``pending``.
             actions: Shape (k, *space.shape).
             pending: State of all episodes; that of ``episodes`` is moved on.
 
@@ -372,9 +372,9 @@ class SequentialAction(ActionEncoding):
         """See `ActionEncoding.decode`."""
         picks = self._checked_indices(episodes, actions)
         picked = pending.picked[episodes]
-        rows = np.arange(len(picks))
-        refused = ~self.available(picked)[rows, picks]
-        picked[rows, picks] |= ~refused
+        every = np.arange(len(picks))
+        refused = ~self.available(picked)[every, picks]
+        picked[every, picks] |= ~refused
         if np.count_nonzero(refused):
             one, each = refused.astype(np.int64), np.ones_like(self.costs)
             picked |= pending.in_turn(episodes, self.available(picked), one, each)

@@ -20,9 +20,9 @@ BLOCKS_PER_THREAD = 4
 
 
 class EpisodeThreads:
-    """Splits the rows of a batch among threads.
+    """Splits the episodes of a batch among threads.
 
-    A row's result does not depend on the block that it is in, so the number of threads changes
+    An episode's result does not depend on the block that it is in, so the number of threads changes
     the time only.
     """
 
@@ -43,18 +43,18 @@ class EpisodeThreads:
         """Pickle without the threads."""
         return type(self), (self.threads,)
 
-    def run(self, n_rows: int, work: Callable[[slice], None]) -> None:
-        """Call ``work`` on slices that cover ``n_rows`` rows; return when all are done.
+    def run(self, n_episodes: int, work: Callable[[slice], None]) -> None:
+        """Call ``work`` on slices that cover ``n_episodes`` episodes; return when all are done.
 
         An exception in any of them is raised here, once all have stopped.
         """
-        n_threads = max(min(self.threads, n_rows // SMALLEST_BLOCK), 1)
+        n_threads = max(min(self.threads, n_episodes // SMALLEST_BLOCK), 1)
         if n_threads == 1:
-            work(slice(0, n_rows))
+            work(slice(0, n_episodes))
             return
         # More blocks than threads: a thread whose core is busy elsewhere then runs fewer of them.
-        n_blocks = min(BLOCKS_PER_THREAD * n_threads, n_rows // SMALLEST_BLOCK)
-        ends = [n_rows * k // n_blocks for k in range(n_blocks + 1)]
+        n_blocks = min(BLOCKS_PER_THREAD * n_threads, n_episodes // SMALLEST_BLOCK)
+        ends = [n_episodes * k // n_blocks for k in range(n_blocks + 1)]
         blocks = iter([slice(*pair) for pair in pairwise(ends)])
 
         def drain() -> None:

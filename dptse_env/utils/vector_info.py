@@ -1,6 +1,6 @@
-"""Conversion of per-episode info between batch rows, scalar dicts and Gymnasium's vector form.
+"""Conversion of per-episode info between batches, scalar dicts and Gymnasium's vector form.
 
-*Rows* of k episodes are a dict of arrays with a leading axis of length k, or of such dicts.
+*Infos* of k episodes are a dict of arrays with a leading axis of length k, or of such dicts.
 Gymnasium's vector form has arrays over all n episodes and, under the same key with a leading
 underscore, the flags of the episodes that have a value.
 """
@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from dptse_env.utils.arrays import IntArray
 
-Rows = dict[str, Any]
+Infos = dict[str, Any]
 
 
-def row_of(rows: Mapping[str, Any], k: int) -> dict[str, Any]:
-    """Return row k, as plain Python numbers and as fresh arrays where a value has a shape."""
+def info_of(infos: Mapping[str, Any], k: int) -> dict[str, Any]:
+    """Return the info of the k-th of some episodes: plain numbers, and fresh arrays of others."""
     return {
-        key: row_of(value, k)
+        key: info_of(value, k)
         if type(value) is dict
         else (value.item(k) if value.ndim == 1 else value[k].copy())
-        for key, value in rows.items()
+        for key, value in infos.items()
     }
 
 
@@ -34,24 +34,24 @@ def object_array(values: list[Any]) -> NDArray[np.object_]:
     return objects
 
 
-def repeated_rows(info: Mapping[str, Any], k: int) -> Rows:
-    """Return the rows of k episodes that have the same info; lists and dicts are shared."""
-    rows: Rows = {}
+def repeated_infos(info: Mapping[str, Any], k: int) -> Infos:
+    """Return the infos of k episodes that have the same one; lists and dicts are shared."""
+    infos: Infos = {}
     for key, value in info.items():
         if isinstance(value, Mapping):
-            rows[key] = repeated_rows(value, k)
+            infos[key] = repeated_infos(value, k)
         elif isinstance(value, bool | int | float):
-            rows[key] = np.full(k, value)
+            infos[key] = np.full(k, value)
         else:
-            rows[key] = object_array([value] * k)
-    return rows
+            infos[key] = object_array([value] * k)
+    return infos
 
 
-def in_vector_form(rows: Mapping[str, Any], episodes: IntArray, n_episodes: int) -> dict[str, Any]:
-    """Spread rows over all episodes, in the form of `gymnasium.vector.VectorEnv`.
+def in_vector_form(given: Mapping[str, Any], episodes: IntArray, n_episodes: int) -> dict[str, Any]:
+    """Spread infos over all episodes, in the form of `gymnasium.vector.VectorEnv`.
 
     Args:
-        rows: Infos of ``episodes``.
+        given: Infos of ``episodes``.
         episodes: Indices, ascending, shape (k,).
         n_episodes: Size of the batch n.
 
@@ -62,7 +62,7 @@ def in_vector_form(rows: Mapping[str, Any], episodes: IntArray, n_episodes: int)
     present = np.zeros(n_episodes, dtype=bool)
     present[episodes] = True
     infos: dict[str, Any] = {}
-    for key, value in rows.items():
+    for key, value in given.items():
         if isinstance(value, Mapping):
             infos[key] = in_vector_form(value, episodes, n_episodes)
         elif len(episodes) == n_episodes:  # all of them, in order
