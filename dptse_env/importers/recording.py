@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from dptse_env.importers import tables, units
+from dptse_env.importers import tables
 from dptse_env.importers.placing import OFF, Road, part_in_words, placed
 from dptse_env.importers.resampling import (
     TIME_UNIT,
@@ -28,6 +28,7 @@ from dptse_env.importers.resampling import (
     whole_seconds,
 )
 from dptse_env.importers.source import Source, TrajectoryError
+from dptse_env.importers.units import SAMPLE, check_units, motion
 from dptse_env.traffic.record import Record
 from dptse_env.utils.fields import cut, inside, integer, non_negative, shown
 
@@ -88,7 +89,6 @@ class Recording:
         shift: What is added to the file's times [s].
         speed_ratio: Given speeds over those that positions say; None without speeds.
         off_names: Names of lanes or edges that are not on the road, some of them.
-        recognised: Units that the points tell and nobody gave, in words.
     """
 
     path: Path
@@ -102,7 +102,6 @@ class Recording:
     shift: float = 0.0
     speed_ratio: float | None = None
     off_names: list[str] = field(default_factory=list)
-    recognised: str = ""
 
     def __post_init__(self) -> None:
         """Read the file and keep its windows in `folder`.
@@ -123,7 +122,7 @@ class Recording:
         pieces = pl.concat([self._take(bucket, coverage) for bucket in range(n_buckets)])
         self._require_one_clock()
         self._require_joined()
-        self.speed_ratio = check_pieces(pieces, str(self.path), self._units)
+        self.speed_ratio = check_pieces(pieces, self.source, self._units, str(self.path))
 
     def record(self, window: int) -> Record:
         """Return the record of a window."""
@@ -161,13 +160,10 @@ class Recording:
         layout, c = self.source.layout, pl.col
         try:
             points, roles, n_rows = tables.scan(self.path, self._form, self.source)
-            sample = points.head(units.SAMPLE).collect(engine="streaming")
-            length = float(self.road.faces[-1])
-            known = units.choose(sample, self.source, self._units, length, str(self.path))
-            if known is not self.source:
-                self.recognised = units.in_words(known, self.source)
-                self.source, self._units = known, {**self._units, **known.units}
-                points, roles, n_rows = tables.scan(self.path, self._form, self.source)
+            sample = points.head(SAMPLE).collect(engine="streaming")
+            time_unit = self.source.factor("time", self._form.units["time"])
+            if moves := motion(sample, self.source, time_unit):
+                check_units(moves, self.source, self._units, str(self.path), whole=False)
             unit = self.source.factor("length", self._form.units["length"])
             n_buckets = min(1 + n_rows // BUCKET_ROWS, MOST_BUCKETS)
             points = placed(points, roles, self.road, layout, unit).select(

@@ -94,10 +94,9 @@ def write_report(
 
 def remarks(file: Mapping[str, Any]) -> list[str]:
     """Return what a user should know of a file of a report, in a line each."""
-    known = [f"recognised {file['recognised']}"] if file["recognised"] else []
     told = {key: words for table in _COUNTS.values() for key, words in table.items()}
     rare = [key for key in told if key not in _ORDINARY and file[key]]
-    return known + [f"{file[key]} {told[key]}" for key in rare]
+    return [f"{file[key]} {told[key]}" for key in rare]
 
 
 def _file(recording: Recording) -> dict[str, Any]:
@@ -108,7 +107,6 @@ def _file(recording: Recording) -> dict[str, Any]:
         "bytes": recording.path.stat().st_size,
         "windows": len(recording.windows),
         "speed_ratio": None if ratio is None else round(ratio, 4),
-        "recognised": recording.recognised,
         "off_the_road": recording.off_names,
         **{name: int(recording.counts[name]) for name in names},
     }
@@ -133,8 +131,6 @@ def _markdown(content: Mapping[str, Any]) -> str:
     parts += [f"- note: {note}" for note in content["notes"]]
     for file in content["files"]:
         parts.append(f"\n## {file['file']}")
-        if file["recognised"]:
-            parts.append(f"\nRecognised, since nobody gave it: {file['recognised']}.")
         for title, told in _COUNTS.items():
             parts.append(f"\n| {title} | |\n| --: | :-- |")
             parts += [f"| {file[key]} | {words} |" for key, words in told.items()]

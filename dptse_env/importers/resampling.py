@@ -10,8 +10,8 @@ import numpy as np
 import polars as pl
 
 from dptse_env.importers.placing import Road
-from dptse_env.importers.source import LENGTHS, SPEEDS, TrajectoryError
-from dptse_env.importers.units import FASTEST_ROAD, SLOWEST_ROAD, TOLERANCE
+from dptse_env.importers.source import Source, TrajectoryError
+from dptse_env.importers.units import Motion, check_units
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.fields import shown
 
@@ -322,7 +322,7 @@ def _pieces(points: pl.DataFrame, counts: Counter[str]) -> pl.DataFrame:
     driven = pl.when("joined").then(mean * c("wait") / 3600.0).otherwise(0.0)
     pieces = points.group_by("chain", maintain_order=True).agg(
         group=c("group").first(), begin=c("time").first(), end=c("time").last(),
-        enters=c("column").first(), leaves=c("column").last(), n=c("n").sum(),
+        enters=c("column").first(), leaves=c("column").last(), n=c("n").sum(), n_points=pl.len(),
         move=c("position").last() - c("position").first(),
         driven=pl.when(c("speed").null_count() == 0).then(driven.sum()),
     )  # fmt: skip
@@ -353,11 +353,19 @@ def count_ends(
     return Counter(told.row(0, named=True))
 
 
-def check_pieces(pieces: pl.DataFrame, where: str, units: Mapping[str, str]) -> float | None:
+def check_pieces(
+    pieces: pl.DataFrame, source: Source, units: Mapping[str, str], where: str
+) -> float | None:
     """Return the median ratio of given speeds to those of positions, of the longer pieces.
 
+    Args:
+        pieces: The pieces of all trajectories of a file.
+        source: What was said of the file.
+        units: Its unit by quantity.
+        where: The file, for messages.
+
     Raises:
-        TrajectoryError: Vehicles move backwards, or the ratio is not near 1.
+        TrajectoryError: Vehicles or speeds are backwards, or as none are; see `check_units`.
     """
     distance = pl.col("move").abs()
     pieces = pieces.filter(distance >= pl.max_horizontal(distance.median(), 1e-9))
@@ -373,27 +381,21 @@ def check_pieces(pieces: pl.DataFrame, where: str, units: Mapping[str, str]) -> 
             f"{where}: {told}, got positions that decrease for {100.0 * share:.0f} % of the "
             "vehicles"
         )
-    lasting = pieces.filter(pl.col("end") > pl.col("begin"))
-    speeds = 3600.0 * lasting["move"] / (lasting["end"] - lasting["begin"])
-    usual: float | None = speeds.median()  # type: ignore[assignment]
-    if usual is not None and not SLOWEST_ROAD <= usual <= FASTEST_ROAD:
-        raise TrajectoryError(
-            f"{where}: vehicles must usually drive {SLOWEST_ROAD:g} to {FASTEST_ROAD:g} km/h, got "
-            f"{usual:.4g} km/h from positions and times: are the units right (time in "
-            f"{units['time']}, length in {units['length']})?"
+    time = pl.col("end") - pl.col("begin")
+    step, speed, ratio = (
+        pieces.filter(time > 0.0)
+        .select(
+            step=(time / (pl.col("n_points") - 1)).median(),
+            speed=(3600.0 * pl.col("move") / time).median(),
+            ratio=pl.col("ratio").drop_nans().median(),
         )
-    ratio: float | None = pieces.select(pl.col("ratio").drop_nans().median()).item()
-    if ratio is None or 1.0 / TOLERANCE <= ratio <= TOLERANCE:
-        return ratio  # None without speeds
-    # Speeds in a larger unit are larger, and so are positions, to which they are held.
-    fits = [
-        f"{name} in {other}"
-        for name, known, power in (("speed", SPEEDS, 1), ("length", LENGTHS, -1))
-        for other, factor in known.items()
-        if abs(ratio * (factor / known[units[name]]) ** power - 1.0) < 0.05
-    ]
-    raise TrajectoryError(
-        f"{where}: speeds must agree with positions, got speeds {ratio:.4g} times as large as "
-        f"positions say (speed in {units['speed']}, length in {units['length']}); what would "
-        f"agree: {' or '.join(fits) or 'no known unit'}"
+        .row(0)
     )
+    if ratio is not None and ratio < 0.0:
+        raise TrajectoryError(
+            f"{where}: speeds must be positive along the road, got {ratio:.4g} times those that "
+            "positions say"
+        )
+    if step is not None:
+        check_units(Motion(step, speed, ratio), source, units, where, whole=True)
+    return ratio  # type: ignore[no-any-return]  # None without speeds

@@ -343,72 +343,70 @@ def test_rows_off_the_road_are_dropped_and_counted(tmp_path):
     assert "veh/h on the mainline, no on-ramps, no exits, average dwell" in text
 
 
+UNITS = {"time": "s", "length": "m", "speed": "m/s"}
+
+
 @pytest.mark.parametrize(
     ("factors", "offset", "message"),
     [
-        ([1, 1, 1, 3.6], 0, r"speeds 3\.6 times as large .*speed in km/h$"),
         ([1, 1, -1, 1], 400, r"layout\.reversed must be turned round"),
+        ([1, 1, 1, -1], 0, r"speeds must be positive along the road, got -1 times"),
         ([1, 1, 1, np.nan], 0, r"row 2: v must be a finite number, got 'nan'"),
         ([1, 1, 1, 1], 900, r"rows must be on the road, got \d+ of \d+"),
         ([1, 0.1, 1, 1], 0, r"it must last 21 s or more, .*, got 13 s \(time in s\)"),
         ([1, 1000, 1, 1], 0, r"got 0 of \d+ that do: are the units \(time in s"),
-        ([1, 0.25, 1, 4], 0, r"usually drive 1 to 250 km/h, got 288 km/h"),
-        ([1, 1, 0.01, 0.01], 0, r"usually drive 1 to 250 km/h, got 0\.72 km/h"),
     ],
 )
 def test_wrong_units_directions_and_numbers_are_refused(factors, offset, message, tmp_path):
     points = stream() * np.array(factors) + np.array([0, 0, offset, 0])
     path = plain(tmp_path / "a.csv", points)
-    units = {"time": "s", "length": "m", "speed": "m/s"}
     with pytest.raises(TrajectoryError, match=message) as refused:
-        run(path, dataclasses.replace(PLAIN, units=units))
+        run(path, dataclasses.replace(PLAIN, units=UNITS))
     assert str(refused.value).startswith(str(path))
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
 
 
+def scaled(path, factors, speed):
+    """Write a stream in other units, with times that are whole numbers where they can be."""
+    vehicle, time, x, speed = (stream(speed=speed) * np.array(factors)).T
+    time = [int(each) if each == round(each) else each for each in time.round(6)]
+    return write_csv(path, {"t": time, "id": vehicle.astype(int), "s": x.round(6), "v": speed})
+
+
 @pytest.mark.parametrize(
-    ("factors", "recognised"),
+    ("factors", "units"),
     [
-        ([1, 1, 1, 1], ""),
         ([1, 1000, 1, 1], "units.time = 'ms'"),
-        ([1, 10, 1, 1], "units.time = 'frame', frame_rate = 10"),
+        ([1, 10, 1, 1], "units.time = 'frame' and frame_rate, the frames a second"),
         ([1, 1, 1, 3.6], "units.speed = 'km/h'"),
         ([1, 1, 1 / 0.3048, 1 / 0.3048], "units.length = 'ft', units.speed = 'ft/s'"),
         ([1, 1000, 0.001, 2.23694], "units.time = 'ms', units.length = 'km', units.speed = 'mi/h'"),
+        ([1, 1, 0.01, 0.01], "none that are known"),
     ],
 )
-def test_units_that_nobody_gave_are_recognised(factors, recognised, tmp_path):
-    points = stream(speed=35.0)
-    expected = record_of(run(plain(subfolder(tmp_path, "plain"), points)), 1)
-    changed = points * np.array(factors)
-    time = [int(each) if each == round(each) else each for each in changed[:, 1].round(6)]
-    changed[:, 2] = changed[:, 2].round(6)
-    path = subfolder(tmp_path, "changed")
-    vehicle, _, x, speed = changed.T
-    write_csv(path, {"t": time, "id": vehicle.astype(int), "s": x, "v": speed})
-    imported = run(path)
-    assert first_file(imported)["recognised"] == recognised
-    text = (tmp_path / "changed" / "imported" / "report.md").read_text("utf-8")
-    assert (f"Recognised, since nobody gave it: {recognised}." in text) == bool(recognised)
-    record = record_of(imported, 1)
-    np.testing.assert_array_equal(record.counts, expected.counts)
-    np.testing.assert_allclose(record.speed_sums, expected.speed_sums, rtol=1e-4)
-
-
-def test_units_that_may_be_several_are_asked_for(tmp_path):
-    points = stream() * [1, 10, 1, 1]  # frames, and no speeds
-    path = write_csv(
-        tmp_path / "a.csv",
-        {"t": points[:, 1].round().astype(int), "id": points[:, 0], "s": points[:, 2]},
-    )
-    columns = {"time": "t", "vehicle": "id", "x": "s"}
-    message = (
-        r"units must be given, likely units\.time = 'frame', frame_rate = 5 or .*: with time in s"
-    )
-    with pytest.raises(TrajectoryError, match=message):
-        run(path, Source("table", columns))
+def test_units_that_cannot_be_are_refused_with_those_that_fit(factors, units, tmp_path):
+    path = scaled(tmp_path / "a.csv", factors, speed=35.0 if units[0] == "u" else 20.0)
+    message = re.escape(f"a.csv: units must be those of the data, likely {units}, got time in s, ")
+    with pytest.raises(TrajectoryError, match=rf"{message}.* by positions, at [\d.e+]+ times"):
+        run(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
-    run(path, Source("table", columns, {"time": "frame"}, frame_rate=10.0))
+
+
+@pytest.mark.parametrize(
+    ("factors", "told"),
+    [
+        ([1, 1, 1, 3.6], r"72 km/h by positions, at 3\.6 times this speed as given"),
+        ([1, 0.25, 1, 4], "vehicles drive 288 km/h"),
+        ([1, 1, 0.01, 0.01], r"vehicles drive 0\.72 km/h"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:no vehicle is on the mainline")
+def test_units_that_are_given_are_kept_and_what_is_odd_is_told(factors, told, tmp_path):
+    path = plain(tmp_path / "a.csv", stream(seconds=240.0) * np.array(factors))
+    with pytest.warns(UserWarning, match=rf"a\.csv: are the units right, as given .*{told}"):
+        imported = run(path, dataclasses.replace(PLAIN, units=UNITS))
+    speed = record_of(imported).speed
+    np.testing.assert_allclose(speed, 72.0 * factors[3], rtol=1e-4)
 
 
 def test_what_is_in_memory_is_a_bucket_not_the_file(tmp_path, monkeypatch):
