@@ -340,7 +340,7 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
         state.place[e] = place
         for j in range(past.shape[0]):
             old, new = past[j, before], past[j, place]
-            # What nothing has followed for hours no longer fades, so that its mean stays.
+            # Stop decaying before the weight underflows, so that the last mean is kept.
             r = stencil.decay if old[WEIGHT] > LEAST_WEIGHT else 1.0
             for c in range(DENSITY_NOISE):
                 new[c] = r * old[c]

@@ -77,7 +77,7 @@ def multiply(
 
 
 @kernel_part
-def move(
+def apply(
     road: RoadArrays,
     blocks: FloatArray,
     by_factor: FloatArray,
@@ -102,7 +102,7 @@ def move(
 
 
 @kernel_part
-def move_back(
+def apply_transposed(
     road: RoadArrays,
     blocks: FloatArray,
     by_factor: FloatArray,

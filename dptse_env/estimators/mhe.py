@@ -15,15 +15,15 @@ import numpy as np
 from dptse_env.estimators import ekf
 from dptse_env.estimators.base import Measurement
 from dptse_env.estimators.ekf import CovarianceFilter, Filters, initial_variance, process_noise
-from dptse_env.estimators.linalg import move, padded
+from dptse_env.estimators.linalg import apply, padded
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.window import (
     UNSOLVED,
     Window,
+    evaluate,
     factorise,
-    look,
     make_factor,
-    make_point,
+    make_iterate,
     minimise,
 )
 from dptse_env.model import ARZModel, Bounds
@@ -80,7 +80,7 @@ class Windows(NamedTuple):
     weights: FloatArray  # (n, L, M, 2, 2 x largest span) of linearised rows
     targets: FloatArray  # (n, L, M, 2) values less the constants of these
     solution: FloatArray  # (n, L, padded)
-    side: IntArray  # (n, L, padded) bounds that the last solution is at, -1, 0 or 1
+    active_set: IntArray  # (n, L, padded) bounds that the last solution is at, -1, 0 or 1
     point: FloatArray  # (n, padded) where the last stage is linearised, unless along the solution
     solved: IntArray  # (n,) how the last program was solved; `UNSOLVED` where there was none too
     fallback: BoolArray  # (n,) whether the last program was not solved, so the prediction stays
@@ -109,7 +109,7 @@ def _enter(filters: Filters, windows: Windows, e: int, t: int) -> None:
         windows.predicted[e, t, i] = filters.means[e, i] / windows.units[i]
         windows.solution[e, t, i] = windows.predicted[e, t, i]
     windows.observed[e, t] = False
-    windows.side[e, t] = 0
+    windows.active_set[e, t] = 0
     windows.noise[e, t] = 1.0
 
 
@@ -134,7 +134,7 @@ def _shift(windows: Windows, e: int) -> None:
     _drop(windows.weights[e].reshape(n_stages, -1))
     _drop(windows.targets[e].reshape(n_stages, -1))
     _drop(windows.solution[e].reshape(n_stages, -1))
-    _drop(windows.side[e].reshape(n_stages, -1))
+    _drop(windows.active_set[e].reshape(n_stages, -1))
 
 
 @kernel_part
@@ -194,7 +194,7 @@ def _linearise_step(
     copy_matrix(scratch.by_factor[:n_factors], windows.by_factor[e, t])
     for i in range(state.size):
         state[i] /= windows.units[i]
-    move(road, blocks, scratch.by_factor, n_factors, state, product)
+    apply(road, blocks, scratch.by_factor, n_factors, state, product)
     for i in range(state.size - n_factors):
         windows.offsets[e, t, i] = after[i] / windows.units[i] - product[i]
 
@@ -235,7 +235,7 @@ def update(
         windows.solved[e], windows.fallback[e] = UNSOLVED, False
         sound = _measure(road, filters, windows, e, values[k], sigma[k])
         window, factor.length[0] = window_of(windows, e), 0
-        side, z = windows.side[e, : last + 1], windows.solution[e, : last + 1].copy()
+        active_set, z = windows.active_set[e, : last + 1], windows.solution[e, : last + 1].copy()
         sound = sound and factorise(road, window, free, factor)
         if sound:
             copy_matrix(factor.covariances[last], filters.covariances[e])
@@ -243,10 +243,10 @@ def update(
             for i in range(windows.units.size):
                 sound = sound and all_finite(filters.covariances[e, i])
         if sound and any_of(observed[k]):
-            windows.solved[e] = minimise(road, window, factor, side, z)
+            windows.solved[e] = minimise(road, window, factor, active_set, z)
             if windows.solved[e] == UNSOLVED:
                 windows.fallback[e] = True
-                windows.side[e] = 0
+                windows.active_set[e] = 0
             else:
                 _accept(road, filters, windows, e, z)
         filters.diverged[e] = not sound
@@ -324,7 +324,7 @@ def _accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: Flo
         for i in range(windows.units.size):
             windows.solution[e, t, i] = z[t, i]
             at_lower, at_upper = z[t, i] <= windows.lower[i], z[t, i] >= windows.upper[i]
-            windows.side[e, t, i] = int(at_upper) - int(at_lower)
+            windows.active_set[e, t, i] = int(at_upper) - int(at_lower)
     for i in range(windows.units.size):
         filters.means[e, i] = z[windows.length[e] - 1, i] * windows.units[i]
     project(road, filters.means[e], filters.is_box)
@@ -355,16 +355,17 @@ def write_program(bundle: Bundle, e: int, H: FloatArray, q: FloatArray) -> None:
     """Write H `(L, n_x, L, n_x)` and q `(L, n_x)` of an episode: z' H z + q' z."""
     road, _, windows = bundle.parts
     window, length, n = window_of(windows, e), windows.length[e], windows.units.size
-    point = make_point(length, windows.solution.shape[2], windows.observed.shape[2])
-    look(road, window, point)
-    start = point.force.copy()
+    iterate = make_iterate(length, windows.solution.shape[2], windows.observed.shape[2])
+    evaluate(road, window, iterate)
+    # At z = 0 the negative gradient of half the objective is -q / 2, at a unit vector e less H e.
+    start = iterate.negative_gradient.copy()
     q[:] = -2.0 * start[:, :n]
     for t in range(length):
         for i in range(n):
-            point.z[t, i] = 1.0
-            look(road, window, point)
-            point.z[t, i] = 0.0
-            H[t, i] = start[:, :n] - point.force[:, :n]
+            iterate.z[t, i] = 1.0
+            evaluate(road, window, iterate)
+            iterate.z[t, i] = 0.0
+            H[t, i] = start[:, :n] - iterate.negative_gradient[:, :n]
 
 
 class MHE(CovarianceFilter):
@@ -441,7 +442,7 @@ def _allocate(model: ARZModel, settings: EstimatorSettings, fallback: BoolArray)
         weights=np.zeros((*shape, n_rows, 2, 2 * int(model.rows.span.max()))),
         targets=np.zeros((*shape, n_rows, 2)),
         solution=np.zeros((*shape, width)),
-        side=np.zeros((*shape, width), dtype=np.int64),
+        active_set=np.zeros((*shape, width), dtype=np.int64),
         point=np.zeros((n_episodes, width)),
         solved=np.zeros(n_episodes, dtype=np.int64),
         fallback=fallback,

@@ -1,16 +1,21 @@
-"""The bounded program of a window, and its solution by forward and backward sweeps.
+"""The bounded least-squares program of a window, and its solution by forward and backward sweeps.
 
-A window is a chain of L states: `minimise |x_0 - arrival|^2 / variance + sum |x_t+1 - A x_t -
-offset|^2 / variance + sum |target - h'x_t|^2 / noise` within bounds. Its Hessian H is
-block-tridiagonal, and its factorisation in the order of time is a Kalman filter's forward pass. A
-component at a bound is a number that is known: a row with a noise of zero. So a filter's forward
-pass and the backward one of Bryson and Frazier (1963) give the minimum for a given set of
-components at bounds.
+A window is a chain of L states z_0, ..., z_{L-1} within bounds, which minimise
 
-`minimise` looks for the set. An active-set method adds the components that are most outside of
-their bounds and releases those whose multiplier points inwards, by columns of H^-1 from a factor
+    J(z) = (z_0 - m)' P_0^-1 (z_0 - m)
+         + sum_t (z_{t+1} - A_t z_t - b_t)' Q_t^-1 (z_{t+1} - A_t z_t - b_t)
+         + sum_t (y_t - C_t z_t)' R_t^-1 (y_t - C_t z_t)
+
+with the arrival's mean m and variance P_0, defects of the transitions and residuals of what was
+measured. Half its Hessian, H, is block-tridiagonal, and its factorisation in the order of time is
+the forward pass of a Kalman filter. A component at a bound is a measurement without noise. So a
+filter's forward pass and the backward pass of Bryson and Frazier (1963) give the minimum for a
+given active set, the components at bounds.
+
+`minimise` looks for the active set. An active-set method adds the components that are most outside
+of their bounds and removes those whose multiplier points inwards, by columns of H^-1 from a factor
 without a set; it is fast but may cycle. Then a projected Newton method (Bertsekas, 1982), whose
-objective falls in every round, factorises anew for each set. All quantities are normalised.
+objective decreases in every round, factorises anew for each set. All quantities are normalised.
 """
 
 from typing import NamedTuple
@@ -19,9 +24,9 @@ import numpy as np
 
 from dptse_env.estimators.linalg import (
     add_product,
+    apply,
+    apply_transposed,
     mirror,
-    move,
-    move_back,
     pair_update,
     propagate,
     scalar_update,
@@ -36,16 +41,16 @@ from dptse_env.utils.kernels import copy_matrix, copy_vector, fill_vector, kerne
 UNSOLVED, ACTIVE_SET, NEWTON = 0, 1, 2
 # Components so near to a bound are set to it: a speed is a quotient of numbers that may vanish.
 AT_BOUND = 1e-13
-LARGEST_SET = 96  # components at a bound, in the active set's rounds
+LARGEST_SET = 96  # components at a bound, in the active-set method
 # The natural residual above which a solution is corrected again, the largest accepted one, and the
-# one from which on it is the residual that has to fall.
+# one from which on it is the residual that has to decrease.
 REFINED, ACCEPTED, NEAR = 3e-13, 1e-9, 1e-7
 # Components join the set if they are outside by more than this share of the largest excess: the
 # others mostly come back with it, and would cost a column of H^-1 each.
 ADDED = 0.9
-ROUNDS = 50  # of the active set
+ROUNDS = 50  # of the active-set method
 NEWTON_ROUNDS, HALVINGS, CORRECTIONS = 200, 4, 6
-SUFFICIENT = 1e-4  # share of the fall along the gradient that is enough (Armijo, 1966)
+SUFFICIENT = 1e-4  # share of the decrease along the gradient that is enough (Armijo, 1966)
 
 
 class Window(NamedTuple):
@@ -65,33 +70,33 @@ class Window(NamedTuple):
     upper: FloatArray  # (n_x,)
 
 
-class Point(NamedTuple):
-    """A trajectory, and what it leaves of each part of the window."""
+class Iterate(NamedTuple):
+    """A trajectory with its defects, residuals and gradient."""
 
     z: FloatArray  # (L, padded)
-    gaps: FloatArray  # (L, padded) of the arrival, then of each transition
-    misfits: FloatArray  # (L, 2 M) of the observed numbers, one after the other
-    force: FloatArray  # (L, padded) minus half the objective's gradient, -(H z + q / 2)
+    defects: FloatArray  # (L, padded) m - z_0, then A z_t + b - z_{t+1} of each transition
+    residuals: FloatArray  # (L, 2 M) y - C z of the observed numbers, one after the other
+    negative_gradient: FloatArray  # (L, padded) of J / 2, -(H z + q / 2)
 
 
 class Factor(NamedTuple):
-    """The factor of a window for a set of components at bounds, and working space of sweeps.
+    """The factor of a window for an active set, and working space of sweeps.
 
     The updates of a stage, U at most, are those of components at bounds, then of observed numbers.
     """
 
     length: IntArray  # (1,) stages that are factorised
-    side: IntArray  # (L, n_x) the set: -1 at the lower bound, 1 at the upper one, 0 free
+    active_set: IntArray  # (L, n_x) -1 at the lower bound, 1 at the upper one, 0 free
     covariances: FloatArray  # (L, n_x, padded) filtered
     before: FloatArray  # (n_x, padded) the last one before its stage's updates
-    n_fixed: IntArray  # (L,) components at a bound
+    n_active: IntArray  # (L,) components at a bound
     n_updates: IntArray  # (L,)
     first: IntArray  # (L, U) the first components that the updates' numbers depend on,
     size: IntArray  # (L, U) the number of these
     rows: FloatArray  # (L, U, 2 x largest span) and the derivatives
     totals: FloatArray  # (L, U) variances of the updates' numbers
     gains: FloatArray  # (L, U, padded)
-    pulls: FloatArray  # (L, U) residuals over these variances, in a sweep
+    weighted_residuals: FloatArray  # (L, U) over these variances, in a sweep
     scratch: FloatArray  # (2, n_x, padded)
     vectors: FloatArray  # (4, padded)
 
@@ -102,17 +107,17 @@ class Columns(NamedTuple):
     known: IntArray  # (1,) their number
     slot: IntArray  # (L, n_x) which one is that of a component, -1 for none
     inverse: FloatArray  # (LARGEST_SET, L, padded)
-    unit: Point  # zero, but for the component whose column is written
+    unit: Iterate  # zero, but for the component whose column is written
     members: IntArray  # (LARGEST_SET, 2) stage and component of those at a bound
     multipliers: FloatArray  # (LARGEST_SET,) of these
 
 
 @kernel_part
-def make_point(n_stages: int, width: int, n_rows: int) -> Point:
-    """Return a trajectory of zeros that leaves nothing."""
+def make_iterate(n_stages: int, width: int, n_rows: int) -> Iterate:
+    """Return a trajectory of zeros without defects and residuals."""
     shape = n_stages, width
-    misfits = np.zeros((n_stages, 2 * n_rows))
-    return Point(np.zeros(shape), np.zeros(shape), misfits, np.zeros(shape))
+    residuals = np.zeros((n_stages, 2 * n_rows))
+    return Iterate(np.zeros(shape), np.zeros(shape), residuals, np.zeros(shape))
 
 
 @kernel_part
@@ -146,10 +151,10 @@ def make_factor(n_stages: int, n: int, n_rows: int, size: int, width: int) -> Fa
 
 
 @kernel_part
-def factorise(road: RoadArrays, window: Window, side: IntArray, factor: Factor) -> bool:
-    """Filter covariances from the first stage whose set of bounds changed; return success."""
+def factorise(road: RoadArrays, window: Window, active_set: IntArray, factor: Factor) -> bool:
+    """Filter covariances from the first stage whose active set changed; return success."""
     n, n_stages, start = window.lower.size, window.targets.shape[0], 0
-    while start < factor.length[0] and _is_same(side[start], factor.side[start]):
+    while start < factor.length[0] and _is_same(active_set[start], factor.active_set[start]):
         start += 1
     for t in range(start, n_stages):
         P = factor.covariances[t]
@@ -165,19 +170,19 @@ def factorise(road: RoadArrays, window: Window, side: IntArray, factor: Factor) 
         if t == n_stages - 1:
             copy_matrix(P, factor.before)
         factor.length[0], factor.n_updates[t] = t, 0
-        if not (_fix(factor, t, side[t]) and _take_rows(road, window, factor, t)):
+        if not (_condition(factor, t, active_set[t]) and _update_by_rows(road, window, factor, t)):
             return False
     factor.length[0] = n_stages
     return True
 
 
 @kernel_part
-def _fix(factor: Factor, t: int, side: IntArray) -> bool:
-    """Condition a stage's covariance on the components of a set; return success."""
+def _condition(factor: Factor, t: int, active_set: IntArray) -> bool:
+    """Condition a stage's covariance on the components at bounds; return success."""
     P, known, column, u = factor.covariances[t], np.ones(1), factor.vectors[0], 0
     for i in range(P.shape[0]):
-        factor.side[t, i] = side[i]
-        if side[i] == 0:
+        factor.active_set[t, i] = active_set[i]
+        if active_set[i] == 0:
             continue
         factor.first[t, u], factor.size[t, u], factor.rows[t, u, 0] = i, 1, 1.0
         gain = factor.gains[t, u]
@@ -188,14 +193,14 @@ def _fix(factor: Factor, t: int, side: IntArray) -> bool:
         for j in range(P.shape[0]):
             P[i, j] = P[j, i] = 0.0
         u += 1
-    factor.n_fixed[t] = factor.n_updates[t] = u
+    factor.n_active[t] = factor.n_updates[t] = u
     return True
 
 
 @kernel_part
-def _take_rows(road: RoadArrays, window: Window, factor: Factor, t: int) -> bool:
+def _update_by_rows(road: RoadArrays, window: Window, factor: Factor, t: int) -> bool:
     """Update a stage's covariance by its observed rows; return success."""
-    P, work, u = factor.covariances[t], factor.vectors, factor.n_fixed[t]
+    P, work, u = factor.covariances[t], factor.vectors, factor.n_active[t]
     for m in range(road.row_first.size):
         if not window.observed[t, m]:
             continue
@@ -230,106 +235,107 @@ def sweep(
     window: Window,
     factor: Factor,
     start: int,
-    point: Point,
-    by_force: bool,
+    iterate: Iterate,
+    from_gradient: bool,
     step: FloatArray,
 ) -> None:
-    """Write the step from a point to the minimum, the factor's set fixed: H step = force.
+    """Write the step from an iterate to the minimum on the factor's active set.
 
-    It is found from gaps and misfits, as a filter's means are: where there is far to go, forces are
-    large numbers that cancel, and lose all digits. Next to the minimum, forces vanish and tell
-    more. From a force of one on one component, by force, the step is a column of H^-1.
-
-    Forwards, a filter's means; backwards, with the costate l of the next stage, d = m + P A' l.
+    Far from the optimum the gradient is a difference of large numbers, so the step is computed
+    from defects and residuals, as a filter computes its means; near the optimum the gradient is
+    more accurate. From a gradient of -1 in one component alone, the step is a column of H^-1.
 
     Args:
         road: The road.
         window: The window.
         factor: Its factor.
-        start: The point leaves nothing before this stage.
-        point: The point.
-        by_force: Whether to go by its force, or by its gaps and misfits.
+        start: The iterate has no defects, residuals and gradient before this stage.
+        iterate: The iterate.
+        from_gradient: Whether to solve H step = negative_gradient, or to use defects and residuals.
         step: `(L, padded)`, written.
     """
-    _go_forwards(road, window, factor, start, point, by_force, step)
-    _come_back(road, window, factor, start, point, by_force, step)
+    _sweep_forwards(road, window, factor, start, iterate, from_gradient, step)
+    _sweep_backwards(road, window, factor, start, iterate, from_gradient, step)
 
 
 @kernel_part
-def _go_forwards(
+def _sweep_forwards(
     road: RoadArrays,
     window: Window,
     factor: Factor,
     start: int,
-    point: Point,
-    by_force: bool,
+    iterate: Iterate,
+    from_gradient: bool,
     step: FloatArray,
 ) -> None:
-    """Write means, and the residuals of updates."""
+    """Write a filter's means of the step, and the weighted residuals of its updates."""
     n_factors = window.lower.size - 2 * road.jam.size
     for t in range(start):
         step[t, :] = 0.0
-        factor.pulls[t, :] = 0.0
+        factor.weighted_residuals[t, :] = 0.0
     for t in range(start, step.shape[0]):
-        mean, n_fixed = step[t], factor.n_fixed[t]
+        mean, n_active = step[t], factor.n_active[t]
         if t == start:
             mean[:] = 0.0
-        else:
-            move(road, window.blocks[t - 1], window.by_factor[t - 1], n_factors, step[t - 1], mean)
-        if not by_force:
-            _add(1.0, point.gaps[t], mean)
+        else:  # mean = A mean + defect
+            apply(road, window.blocks[t - 1], window.by_factor[t - 1], n_factors, step[t - 1], mean)
+        if not from_gradient:
+            _add(1.0, iterate.defects[t], mean)
         for u in range(factor.n_updates[t]):
-            gap = 0.0 if by_force or u < n_fixed else point.misfits[t, u - n_fixed]
+            # mean = mean + k (r - h' mean), with the gain k (Kalman, 1960)
+            r = 0.0 if from_gradient or u < n_active else iterate.residuals[t, u - n_active]
             for i in range(factor.size[t, u]):
-                gap -= factor.rows[t, u, i] * mean[factor.first[t, u] + i]
-            _add(gap, factor.gains[t, u], mean)
-            factor.pulls[t, u] = gap / factor.totals[t, u]
-        if by_force:
-            add_product(factor.covariances[t], point.force[t], mean)
+                r -= factor.rows[t, u, i] * mean[factor.first[t, u] + i]
+            _add(r, factor.gains[t, u], mean)
+            factor.weighted_residuals[t, u] = r / factor.totals[t, u]
+        if from_gradient:
+            add_product(factor.covariances[t], iterate.negative_gradient[t], mean)
 
 
 @kernel_part
-def _come_back(
+def _sweep_backwards(
     road: RoadArrays,
     window: Window,
     factor: Factor,
     start: int,
-    point: Point,
-    by_force: bool,
+    iterate: Iterate,
+    from_gradient: bool,
     step: FloatArray,
 ) -> None:
-    """Turn means into the minimum, by what later stages pull."""
-    n, costate, pull = window.lower.size, factor.vectors[2], factor.vectors[3]
+    """Turn the means into the step, by the costates l of later stages."""
+    n, costate, adjoint = window.lower.size, factor.vectors[2], factor.vectors[3]
     costate[:] = 0.0
     for t in range(step.shape[0] - 1, -1, -1):
         if t < step.shape[0] - 1:
+            # l = A' l and step = mean + P l (Bryson and Frazier, 1963)
             blocks, by_factor = window.blocks[t], window.by_factor[t]
-            move_back(road, blocks, by_factor, n - 2 * road.jam.size, costate, pull)
-            add_product(factor.covariances[t], pull, step[t])
-            copy_vector(pull, costate)
-        for i in range(n if by_force and t >= start else 0):
-            if factor.side[t, i] == 0:
-                costate[i] += point.force[t, i]
+            apply_transposed(road, blocks, by_factor, n - 2 * road.jam.size, costate, adjoint)
+            add_product(factor.covariances[t], adjoint, step[t])
+            copy_vector(adjoint, costate)
+        for i in range(n if from_gradient and t >= start else 0):
+            if factor.active_set[t, i] == 0:
+                costate[i] += iterate.negative_gradient[t, i]
         for u in range(factor.n_updates[t] - 1, -1, -1):
-            multiplier = factor.pulls[t, u] - _dot(factor.gains[t, u], costate)
+            # l = l + h (r / s - k' l), with the variance s of the number
+            multiplier = factor.weighted_residuals[t, u] - _dot(factor.gains[t, u], costate)
             for i in range(factor.size[t, u]):
                 costate[factor.first[t, u] + i] += multiplier * factor.rows[t, u, i]
 
 
 @kernel_part
-def fix(
+def solve_on_active_set(
     road: RoadArrays,
     window: Window,
     factor: Factor,
     columns: Columns,
     z: FloatArray,
-    side: IntArray,
+    active_set: IntArray,
     step: FloatArray,
 ) -> bool:
-    """Correct a free step so that components of a set get to their bounds; return success.
+    """Correct a free step so that an active set gets to its bounds; return success.
 
     It does what a `sweep` with the set would, from the factor without one, by columns of H^-1. It
-    fails where they are too many, or the set is not of full rank.
+    fails where the set has more than `LARGEST_SET` components or is not of full rank.
 
     Args:
         road: The road.
@@ -337,41 +343,42 @@ def fix(
         factor: Its factor without components at bounds.
         columns: Known columns, to which others are added; members and multipliers are written.
         z: `(L, padded)` the trajectory.
-        side: `(L, padded)` the set.
+        active_set: `(L, padded)`.
         step: `(L, padded)` the free step, replaced.
     """
     m, members, unit = 0, columns.members, columns.unit
     for t in range(step.shape[0]):
         for i in range(window.lower.size):
-            if side[t, i] == 0:
+            if active_set[t, i] == 0:
                 continue
             known = columns.known[0]
             if m == LARGEST_SET or (columns.slot[t, i] < 0 and known == LARGEST_SET):
                 return False
             members[m, 0], members[m, 1], m = t, i, m + 1
             if columns.slot[t, i] < 0:
-                unit.force[t, i], column = 1.0, columns.inverse[known]
+                unit.negative_gradient[t, i], column = 1.0, columns.inverse[known]
                 sweep(road, window, factor, t, unit, True, column)
-                unit.force[t, i] = 0.0
+                unit.negative_gradient[t, i] = 0.0
                 columns.slot[t, i], columns.known[0] = known, known + 1
-    matrix, needed = np.empty((m, m)), columns.multipliers
+    # (H^-1)_AA multipliers = bounds - z - step on the set A; step = step + H^-1_A multipliers
+    matrix, multipliers = np.empty((m, m)), columns.multipliers
     for a in range(m):
         t, i = members[a, 0], members[a, 1]
-        bound = window.lower[i] if side[t, i] < 0 else window.upper[i]
-        needed[a] = bound - z[t, i] - step[t, i]
+        bound = window.lower[i] if active_set[t, i] < 0 else window.upper[i]
+        multipliers[a] = bound - z[t, i] - step[t, i]
         column = columns.inverse[columns.slot[t, i]]
         for b in range(a, m):
             matrix[b, a] = column[members[b, 0], members[b, 1]]
     if not cholesky(matrix):
         return False
-    solve(matrix, needed[:m])
+    solve(matrix, multipliers[:m])
     for a in range(m):
         column = columns.inverse[columns.slot[members[a, 0], members[a, 1]]]
         for t in range(step.shape[0]):
-            _add(needed[a], column[t], step[t])
+            _add(multipliers[a], column[t], step[t])
     for a in range(m):
         t, i = members[a, 0], members[a, 1]
-        step[t, i] = (window.lower[i] if side[t, i] < 0 else window.upper[i]) - z[t, i]
+        step[t, i] = (window.lower[i] if active_set[t, i] < 0 else window.upper[i]) - z[t, i]
     return True
 
 
@@ -390,40 +397,46 @@ def _dot(x: FloatArray, y: FloatArray) -> float:
 
 
 @kernel_part
-def look(road: RoadArrays, window: Window, point: Point) -> None:
-    """Write the gaps, misfits and force of a point's trajectory."""
-    z, gaps, force, n = point.z, point.gaps, point.force, window.lower.size
-    n_factors, pull, weighed = n - 2 * road.jam.size, np.empty(z.shape[1]), np.empty(z.shape[1])
-    for i in range(n):
-        gaps[0, i] = window.arrival[i] - z[0, i]
-        force[0, i] = gaps[0, i] / window.arrival_variance[i]
+def evaluate(road: RoadArrays, window: Window, iterate: Iterate) -> None:
+    """Write the defects, residuals and gradient of an iterate's trajectory."""
+    z, defects, descent, n = (
+        iterate.z,
+        iterate.defects,
+        iterate.negative_gradient,
+        window.lower.size,
+    )
+    n_factors, adjoint, weighted = n - 2 * road.jam.size, np.empty(z.shape[1]), np.empty(z.shape[1])
+    for i in range(n):  # d_0 = m - z_0
+        defects[0, i] = window.arrival[i] - z[0, i]
+        descent[0, i] = defects[0, i] / window.arrival_variance[i]
     for t in range(1, z.shape[0]):
         blocks, by_factor = window.blocks[t - 1], window.by_factor[t - 1]
-        move(road, blocks, by_factor, n_factors, z[t - 1], weighed)
+        apply(road, blocks, by_factor, n_factors, z[t - 1], weighted)
+        # d_t = A z_{t-1} + b - z_t adds Q^-1 d_t to stage t and -A' Q^-1 d_t to stage t - 1
         for i in range(n):
-            gaps[t, i] = weighed[i] + window.offsets[t - 1, i] - z[t, i]
-            force[t, i] = weighed[i] = gaps[t, i] / window.process_variance[t - 1, i]
-        move_back(road, blocks, by_factor, n_factors, weighed, pull)
+            defects[t, i] = weighted[i] + window.offsets[t - 1, i] - z[t, i]
+            descent[t, i] = weighted[i] = defects[t, i] / window.process_variance[t - 1, i]
+        apply_transposed(road, blocks, by_factor, n_factors, weighted, adjoint)
         for i in range(n):
-            force[t - 1, i] -= pull[i]
+            descent[t - 1, i] -= adjoint[i]
     for t in range(z.shape[0]):
-        r = 0
+        u = 0
         for m in range(road.row_first.size):
             if not window.observed[t, m]:
                 continue
             first, size = 2 * road.row_first[m], 2 * road.row_span[m]
-            for q in range(2):
-                row, gap = window.weights[t, m, q], window.targets[t, m, q]
+            for q in range(2):  # r = y - c' z_t adds c r / R
+                row, r = window.weights[t, m, q], window.targets[t, m, q]
                 for i in range(size):
-                    gap -= row[i] * z[t, first + i]
-                point.misfits[t, r], r = gap, r + 1
+                    r -= row[i] * z[t, first + i]
+                iterate.residuals[t, u], u = r, u + 1
                 for i in range(size):
-                    force[t, first + i] += row[i] * gap / window.noise[t, m, q]
+                    descent[t, first + i] += row[i] * r / window.noise[t, m, q]
 
 
 @kernel_part
 def write_diagonal(road: RoadArrays, window: Window, diagonal: FloatArray) -> None:
-    """Write the diagonal `(L, padded)` of H, in whose units a residual is measured."""
+    """Write the diagonal `(L, padded)` of H, P_0^-1 or Q^-1 plus A' Q^-1 A plus C' R^-1 C."""
     n, n_stages = 2 * road.jam.size, diagonal.shape[0]
     for t in range(n_stages):
         variance = window.arrival_variance if t == 0 else window.process_variance[t - 1]
@@ -451,95 +464,99 @@ def write_diagonal(road: RoadArrays, window: Window, diagonal: FloatArray) -> No
 
 @kernel_part
 def minimise(
-    road: RoadArrays, window: Window, factor: Factor, side: IntArray, z: FloatArray
+    road: RoadArrays, window: Window, factor: Factor, active_set: IntArray, z: FloatArray
 ) -> int:
     """Replace a trajectory by the minimiser; return how, or `UNSOLVED`.
 
-    A solution is accepted by its natural residual |z - clip(z - g / diag H, lower, upper)|.
+    A solution is accepted by its `_natural_residual`.
 
     Args:
         road: The road.
         window: The window.
         factor: Its factor without components at bounds; another one afterwards.
-        side: `(L, padded)` a guess of the set of bounds, replaced.
+        active_set: `(L, padded)` a guess, replaced.
         z: `(L, padded)` a guess of the trajectory, replaced.
     """
     n_stages, width, n_rows = *z.shape, road.row_first.size
-    here, there = make_point(n_stages, width, n_rows), make_point(n_stages, width, n_rows)
+    current, trial = make_iterate(n_stages, width, n_rows), make_iterate(n_stages, width, n_rows)
     diagonal = np.ones((n_stages, width))
     write_diagonal(road, window, diagonal)
-    _clip(window.lower, window.upper, z, 0.0, z, here.z)
-    look(road, window, here)
-    if _find_set(road, window, factor, diagonal, side, here, there):
-        copy_matrix(there.z, z)
+    _clip(window.lower, window.upper, z, 0.0, z, current.z)
+    evaluate(road, window, current)
+    if _find_active_set(road, window, factor, diagonal, active_set, current, trial):
+        copy_matrix(trial.z, z)
         return ACTIVE_SET
-    if _descend(road, window, factor, diagonal, side, here, there, z):
+    if _projected_newton(road, window, factor, diagonal, active_set, current, trial, z):
         return NEWTON
     return UNSOLVED
 
 
 @kernel_part
-def _find_set(
+def _find_active_set(
     road: RoadArrays,
     window: Window,
     factor: Factor,
     diagonal: FloatArray,
-    side: IntArray,
-    here: Point,
-    there: Point,
+    active_set: IntArray,
+    current: Iterate,
+    trial: Iterate,
 ) -> bool:
-    """Look for the set of bounds, and write its minimum to `there`; return whether it is one."""
-    n, n_stages, width = window.lower.size, *there.z.shape
+    """Look for the active set, and write its minimum to `trial`; return whether it is optimal."""
+    n, n_stages, width = window.lower.size, *trial.z.shape
     columns = Columns(
         np.zeros(1, np.int64),
         np.full((n_stages, n), -1),
         np.empty((LARGEST_SET, n_stages, width)),
-        make_point(n_stages, width, 0),
+        make_iterate(n_stages, width, 0),
         np.empty((LARGEST_SET, 2), np.int64),
         np.empty(LARGEST_SET),
     )
     lower, upper = window.lower, window.upper
     free, step = np.empty((n_stages, width)), np.empty((n_stages, width))
-    sweep(road, window, factor, 0, here, False, free)
+    sweep(road, window, factor, 0, current, False, free)
     for _ in range(ROUNDS):
         copy_matrix(free, step)
-        if not fix(road, window, factor, columns, here.z, side, step):
+        if not solve_on_active_set(road, window, factor, columns, current.z, active_set, step):
             return False
-        if not _revise(lower, upper, columns.multipliers, here.z, step, side):
+        if not _revise_active_set(lower, upper, columns.multipliers, current.z, step, active_set):
             break
     else:
         return False
-    _clip(lower, upper, here.z, 1.0, step, there.z)
+    _clip(lower, upper, current.z, 1.0, step, trial.z)
     for _ in range(CORRECTIONS):
-        look(road, window, there)
-        if _residual(lower, upper, diagonal, there) <= REFINED:
+        evaluate(road, window, trial)
+        if _natural_residual(lower, upper, diagonal, trial) <= REFINED:
             return True
-        sweep(road, window, factor, 0, there, True, step)
-        fix(road, window, factor, columns, there.z, side, step)
-        _clip(lower, upper, there.z, 1.0, step, there.z)
-    look(road, window, there)
-    return _residual(lower, upper, diagonal, there) <= ACCEPTED
+        sweep(road, window, factor, 0, trial, True, step)
+        solve_on_active_set(road, window, factor, columns, trial.z, active_set, step)
+        _clip(lower, upper, trial.z, 1.0, step, trial.z)
+    evaluate(road, window, trial)
+    return _natural_residual(lower, upper, diagonal, trial) <= ACCEPTED
 
 
 @kernel_part
-def _revise(
+def _revise_active_set(
     lower: FloatArray,
     upper: FloatArray,
     multipliers: FloatArray,
     z: FloatArray,
     step: FloatArray,
-    side: IntArray,
+    active_set: IntArray,
 ) -> bool:
-    """Release components that pull inwards, add those far outside; return whether any did."""
+    """Remove components whose multiplier points inwards, add those that are furthest outside.
+
+    Returns:
+        Whether the set changed.
+    """
     changed, least, a = False, AT_BOUND, 0
     for t in range(z.shape[0]):
         for i in range(lower.size):
-            if side[t, i] == 0:
+            if active_set[t, i] == 0:
                 value = z[t, i] + step[t, i]
                 least = max(least, ADDED * max(lower[i] - value, value - upper[i]))
     for t in range(z.shape[0]):
         for i in range(lower.size):
-            value, new = z[t, i] + step[t, i], side[t, i]
+            value, new = z[t, i] + step[t, i], active_set[t, i]
             if new != 0:
                 new = 0 if multipliers[a] * new > 0.0 else new
                 a += 1
@@ -547,54 +564,54 @@ def _revise(
                 new = -1
             elif value > upper[i] + least:
                 new = 1
-            if new != side[t, i]:
-                side[t, i], changed = new, True
+            if new != active_set[t, i]:
+                active_set[t, i], changed = new, True
     return changed
 
 
 @kernel_part
-def _descend(
+def _projected_newton(
     road: RoadArrays,
     window: Window,
     factor: Factor,
     diagonal: FloatArray,
-    side: IntArray,
-    here: Point,
-    there: Point,
+    active_set: IntArray,
+    current: Iterate,
+    trial: Iterate,
     z: FloatArray,
 ) -> bool:
-    """Bring a point within bounds down to the minimum, and write it; return whether it is there.
+    """Minimise from an iterate within bounds by projected Newton steps; return success.
 
-    Components that the gradient presses against their bound are fixed. The step to the minimum of
-    the others is clipped to the bounds, and halved until the objective falls far enough. After some
-    halvings it ends at the first bound instead, so that the objective falls in any case: components
-    at a bound that it would take across are fixed as well, until there is none.
+    The active set has the components that the gradient presses against their bound. The step to
+    the minimum of the others is clipped to the bounds, and halved until the objective decreases
+    enough. After some halvings it ends at the first bound instead, so that the objective decreases
+    in any case: components at a bound that it would take across join the set, until there are none.
     """
     lower, upper, step = window.lower, window.upper, np.empty(z.shape)
-    residual = _residual(lower, upper, diagonal, here)
+    residual = _natural_residual(lower, upper, diagonal, current)
     for _ in range(NEWTON_ROUNDS):
         if residual <= REFINED:
             break
         for t in range(z.shape[0]):
             for i in range(lower.size):
-                at_lower = here.z[t, i] <= lower[i] and here.force[t, i] < 0.0
-                at_upper = here.z[t, i] >= upper[i] and here.force[t, i] > 0.0
-                side[t, i] = int(at_upper) - int(at_lower)
+                at_lower = current.z[t, i] <= lower[i] and current.negative_gradient[t, i] < 0.0
+                at_upper = current.z[t, i] >= upper[i] and current.negative_gradient[t, i] > 0.0
+                active_set[t, i] = int(at_upper) - int(at_lower)
         is_near, before, length, found = residual <= NEAR, residual, 1.0, False
-        if not _step_on(road, window, factor, side, here, is_near, step):
+        if not _newton_step(road, window, factor, active_set, current, is_near, step):
             return False
         for halving in range(HALVINGS + 1):
             if halving == HALVINGS:
-                length = _reach(lower, upper, here.z, step, side)
+                length = _step_to_bound(lower, upper, current.z, step, active_set)
                 while length < 0.0:
-                    if not _step_on(road, window, factor, side, here, is_near, step):
+                    if not _newton_step(road, window, factor, active_set, current, is_near, step):
                         return False
-                    length = _reach(lower, upper, here.z, step, side)
-            _clip(lower, upper, here.z, length, step, there.z)
-            look(road, window, there)
-            residual = _residual(lower, upper, diagonal, there)
-            # Next to the minimum, rounding decides whether the objective falls.
-            found = (is_near and residual <= 0.5 * before) or _falls(lower.size, here, there)
+                    length = _step_to_bound(lower, upper, current.z, step, active_set)
+            _clip(lower, upper, current.z, length, step, trial.z)
+            evaluate(road, window, trial)
+            residual = _natural_residual(lower, upper, diagonal, trial)
+            # Near the minimum, rounding decides whether the objective decreases.
+            found = (is_near and residual <= 0.5 * before) or _decreases(lower.size, current, trial)
             if found:
                 break
             length *= 0.5
@@ -603,45 +620,46 @@ def _descend(
             break
         if not found:
             return False
-        here, there = there, here
-    copy_matrix(here.z, z)
+        current, trial = trial, current
+    copy_matrix(current.z, z)
     return residual <= ACCEPTED
 
 
 @kernel_part
-def _step_on(
+def _newton_step(
     road: RoadArrays,
     window: Window,
     factor: Factor,
-    side: IntArray,
-    point: Point,
+    active_set: IntArray,
+    iterate: Iterate,
     is_near: bool,
     step: FloatArray,
 ) -> bool:
-    """Write the step to the minimum with a set fixed; return success."""
-    sound = factorise(road, window, side, factor)
+    """Write the step to the minimum on an active set; return success."""
+    sound = factorise(road, window, active_set, factor)
     if sound:
-        sweep(road, window, factor, 0, point, is_near, step)
+        sweep(road, window, factor, 0, iterate, is_near, step)
     return sound
 
 
 @kernel_part
-def _reach(
-    lower: FloatArray, upper: FloatArray, z: FloatArray, step: FloatArray, side: IntArray
+def _step_to_bound(
+    lower: FloatArray, upper: FloatArray, z: FloatArray, step: FloatArray, active_set: IntArray
 ) -> float:
-    """Return how far a step goes up to the first bound, 0 to 1.
+    """Return the share of a step, 0 to 1, up to the first bound.
 
-    It is -1 where the step takes components at a bound across it; these join the set.
+    Returns -1 if a component already at a bound would leave the feasible set; it is then added to
+    the active set.
     """
     length, crosses, stage, component = 1.0, False, -1, -1
     for t in range(z.shape[0]):
         for i in range(lower.size):
             d = step[t, i]
-            if side[t, i] != 0 or d == 0.0:
+            if active_set[t, i] != 0 or d == 0.0:
                 continue
             room = lower[i] - z[t, i] if d < 0.0 else upper[i] - z[t, i]
             if room == 0.0:
-                side[t, i], crosses = (-1 if d < 0.0 else 1), True
+                active_set[t, i], crosses = (-1 if d < 0.0 else 1), True
             elif room / d < length:
                 length, stage, component = room / d, t, i
     if crosses:
@@ -652,14 +670,15 @@ def _reach(
 
 
 @kernel_part
-def _falls(n: int, here: Point, there: Point) -> bool:
-    """Return whether the objective falls far enough from one point to another."""
+def _decreases(n: int, current: Iterate, trial: Iterate) -> bool:
+    """Return whether the objective decreases enough from one iterate to another."""
+    # J(trial) - J(current) <= SUFFICIENT g' (trial - current) (Armijo, 1966)
     along, change = 0.0, 0.0
-    for t in range(here.z.shape[0]):
+    for t in range(current.z.shape[0]):
         for i in range(n):
-            step = there.z[t, i] - here.z[t, i]
-            along -= here.force[t, i] * step
-            change -= 0.5 * (here.force[t, i] + there.force[t, i]) * step
+            step = trial.z[t, i] - current.z[t, i]
+            along -= current.negative_gradient[t, i] * step
+            change -= 0.5 * (current.negative_gradient[t, i] + trial.negative_gradient[t, i]) * step
     return change <= SUFFICIENT * along
 
 
@@ -684,13 +703,15 @@ def _clip(
 
 
 @kernel_part
-def _residual(lower: FloatArray, upper: FloatArray, diagonal: FloatArray, point: Point) -> float:
-    """Return the largest |z - clip(z - g / diag H, lower, upper)|, g = -force; it may be NaN."""
+def _natural_residual(
+    lower: FloatArray, upper: FloatArray, diagonal: FloatArray, iterate: Iterate
+) -> float:
+    """Return the largest |z - clip(z - g / diag H, lower, upper)|, g = H z + q / 2; may be NaN."""
     largest = 0.0
     for t in range(diagonal.shape[0]):
         for i in range(lower.size):
-            target = point.z[t, i] + point.force[t, i] / diagonal[t, i]
-            gap = abs(point.z[t, i] - min(max(target, lower[i]), upper[i]))
+            target = iterate.z[t, i] + iterate.negative_gradient[t, i] / diagonal[t, i]
+            gap = abs(iterate.z[t, i] - min(max(target, lower[i]), upper[i]))
             if not gap <= largest:  # also true for a NaN
                 largest = gap
     return largest

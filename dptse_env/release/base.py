@@ -89,7 +89,7 @@ class PrivacySettings:
 
 
 class Group(NamedTuple):
-    """Columns of a release that see the same vehicles and have a part of the budget to themselves.
+    """Release channels that share a vehicle population and a fixed share of the privacy budget.
 
     Attributes:
         name: ``queries`` or ``sensors``.

@@ -95,7 +95,7 @@ def inline_part(function: Function) -> Function:
 
 
 class _PartLibrary(JITCodeLibrary):
-    """numba's code of a part, which is optimised and becomes machine code in kernels alone."""
+    """Code library that is linked into its callers and never compiled on its own."""
 
     def _optimize_final_module(self) -> None: ...
 

@@ -9,10 +9,10 @@ from dptse_env.traffic import PAPER_HIGHWAY
 from tests.helpers import compiled
 from tests.model.oracle import PAPER
 
-add_product, factor, forward, is_covariance, mirror, move, move_back = (
+add_product, factor, forward, is_covariance, mirror, apply, apply_transposed = (
     compiled(getattr(linalg, part))
     for part in (
-        "add_product", "factor", "forward", "is_covariance", "mirror", "move", "move_back",
+        "add_product", "factor", "forward", "is_covariance", "mirror", "apply", "apply_transposed",
     )
 )  # fmt: skip
 pair_update, products, propagate, scalar_update, solve, solve_many = (
@@ -69,9 +69,9 @@ def test_propagation_is_that_of_dense_matrices(n_factors):
     np.testing.assert_array_equal(P, out)
 
     x, moved = rng.normal(size=n), np.empty(n)
-    move(ROAD, blocks, by_factor, n_factors, x, moved)
+    apply(ROAD, blocks, by_factor, n_factors, x, moved)
     np.testing.assert_allclose(moved, F @ x, rtol=1e-12, atol=1e-12)
-    move_back(ROAD, blocks, by_factor, n_factors, x, moved)
+    apply_transposed(ROAD, blocks, by_factor, n_factors, x, moved)
     np.testing.assert_allclose(moved, F.T @ x, rtol=1e-12, atol=1e-12)
 
 

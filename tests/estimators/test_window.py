@@ -9,13 +9,13 @@ from dptse_env.estimators import window as parts
 from dptse_env.estimators import with_demand
 from dptse_env.estimators.linalg import padded
 from dptse_env.estimators.reference import natural_residual, solve
-from dptse_env.estimators.window import ACTIVE_SET, NEWTON, REFINED, Point, Window
+from dptse_env.estimators.window import ACTIVE_SET, NEWTON, REFINED, Iterate, Window
 from tests.helpers import UNEVEN, compiled
 
 from .helpers import RICH, model_of
 
 factorise, sweep = compiled(parts.factorise), compiled(parts.sweep)
-look, write_diagonal = compiled(parts.look), compiled(parts.write_diagonal)
+evaluate, write_diagonal = compiled(parts.evaluate), compiled(parts.write_diagonal)
 make_factor, minimise = compiled(parts.make_factor), compiled(parts.minimise)
 
 MODEL = with_demand(model_of("w99-3lane", "rows", UNEVEN), RICH)
@@ -100,61 +100,62 @@ def dense(window):
     return H, q
 
 
-def point_at(program, z):
-    """The gaps and misfits that a trajectory `(L, n_x)` leaves."""
+def iterate_at(program, z):
+    """An iterate with a trajectory `(L, n_x)`."""
     shape = program.n_stages, WIDTH
-    misfits = np.zeros((program.n_stages, 2 * N_ROWS))
-    point = Point(np.zeros(shape), np.zeros(shape), misfits, np.zeros(shape))
-    point.z[:, :N] = z
-    look(ROAD, program.window, point)
-    return point
+    residuals = np.zeros((program.n_stages, 2 * N_ROWS))
+    iterate = Iterate(np.zeros(shape), np.zeros(shape), residuals, np.zeros(shape))
+    iterate.z[:, :N] = z
+    evaluate(ROAD, program.window, iterate)
+    return iterate
 
 
-def random_side(program, n_fixed, seed=1):
-    side = np.zeros((program.n_stages, N), np.int64)
-    at = np.random.default_rng(seed).choice(side.size, n_fixed, replace=False)
-    side.flat[at] = 1
-    return side
+def random_set(program, n_active, seed=1):
+    active_set = np.zeros((program.n_stages, N), np.int64)
+    at = np.random.default_rng(seed).choice(active_set.size, n_active, replace=False)
+    active_set.flat[at] = 1
+    return active_set
 
 
-def factor_of(program, side):
+def factor_of(program, active_set):
     factor = make_factor(program.n_stages, N, N_ROWS, program.window.weights.shape[3], WIDTH)
-    assert factorise(ROAD, program.window, side, factor)
+    assert factorise(ROAD, program.window, active_set, factor)
     return factor
 
 
-def step_from(program, factor, point, by_force):
+def step_from(program, factor, iterate, from_gradient):
     step = np.empty((program.n_stages, WIDTH))
-    sweep(ROAD, program.window, factor, 0, point, by_force, step)
+    sweep(ROAD, program.window, factor, 0, iterate, from_gradient, step)
     return step[:, :N]
 
 
-def test_what_a_point_leaves_is_the_objectives_gradient():
+def test_an_iterate_has_the_objectives_gradient():
     program = random_program()
     z = np.random.default_rng(2).random((4, N))
-    force, diagonal = point_at(program, z).force[:, :N].ravel(), np.ones((4, WIDTH))
-    np.testing.assert_allclose(force, -program.H @ z.ravel() - program.q / 2, atol=1e-10)
+    found, diagonal = iterate_at(program, z).negative_gradient[:, :N], np.ones((4, WIDTH))
+    expected = -program.H @ z.ravel() - program.q / 2
+    np.testing.assert_allclose(found.ravel(), expected, atol=1e-10)
     write_diagonal(ROAD, program.window, diagonal)
     np.testing.assert_allclose(diagonal[:, :N].ravel(), np.diag(program.H), rtol=1e-12)
 
 
-@pytest.mark.parametrize("by_force", [False, True])
-@pytest.mark.parametrize("n_fixed", [0, 40])
-def test_a_sweep_steps_to_the_minimum_with_components_fixed(n_fixed, by_force):
+@pytest.mark.parametrize("from_gradient", [False, True])
+@pytest.mark.parametrize("n_active", [0, 40])
+def test_a_sweep_steps_to_the_minimum_with_components_fixed(n_active, from_gradient):
     program, z = random_program(), np.random.default_rng(2).random((4, N))
-    side = random_side(program, n_fixed)
-    factor, free = factor_of(program, side), side.ravel() == 0
-    point, expected = point_at(program, z), np.zeros(free.size)
-    force = -program.H @ z.ravel() - program.q / 2
+    active_set = random_set(program, n_active)
+    factor, free = factor_of(program, active_set), active_set.ravel() == 0
+    iterate, expected = iterate_at(program, z), np.zeros(free.size)
+    negative_gradient = -program.H @ z.ravel() - program.q / 2
     inverse = np.linalg.inv(program.H[np.ix_(free, free)])
-    expected[free] = inverse @ force[free]
-    step = step_from(program, factor, point, by_force)
+    expected[free] = inverse @ negative_gradient[free]
+    step = step_from(program, factor, iterate, from_gradient)
     np.testing.assert_allclose(step.ravel(), expected, atol=1e-10)
     assert (step.ravel()[~free] == 0.0).all()
     last, end = free[-N:], np.zeros((N, N))
     end[np.ix_(last, last)] = inverse[-last.sum() :, -last.sum() :]
     np.testing.assert_allclose(factor.covariances[-1][:, :N], end, atol=1e-12)
-    if n_fixed == 0:  # and before the last rows
+    if n_active == 0:  # and before the last rows
         program.window.observed[-1] = False
         blind = np.linalg.inv(dense(program.window)[0])[-N:, -N:]
         np.testing.assert_allclose(factor.before[:, :N], blind, atol=1e-12)
@@ -162,12 +163,12 @@ def test_a_sweep_steps_to_the_minimum_with_components_fixed(n_fixed, by_force):
 
 def test_a_factor_is_renewed_from_the_first_stage_whose_set_differs():
     program, z = random_program(), np.random.default_rng(2).random((4, N))
-    one, other = random_side(program, 30), random_side(program, 30, seed=4)
+    one, other = random_set(program, 30), random_set(program, 30, seed=4)
     other[:2] = one[:2]
     used = factor_of(program, one)
     assert factorise(ROAD, program.window, other, used)
-    fresh, point = factor_of(program, other), point_at(program, z)
-    steps = [step_from(program, factor, point, False) for factor in (used, fresh)]
+    fresh, iterate = factor_of(program, other), iterate_at(program, z)
+    steps = [step_from(program, factor, iterate, False) for factor in (used, fresh)]
     np.testing.assert_array_equal(*steps)
 
 
@@ -180,10 +181,10 @@ def test_a_minimum_within_bounds_is_that_of_a_general_solver(spread, n_stages, h
     """With many components at bounds, too many for the active set."""
     program = random_program(n_stages, spread=spread)
     factor = factor_of(program, np.zeros((n_stages, N), np.int64))
-    z, side = np.zeros((n_stages, WIDTH)), np.zeros((n_stages, WIDTH), np.int64)
+    z, active_set = np.zeros((n_stages, WIDTH)), np.zeros((n_stages, WIDTH), np.int64)
     z[:, :N] = 0.5 if guess == "middle" else 0.0
-    side[:, :N] = 0 if guess == "middle" else np.where(np.arange(N) % 7 == 0, -1, 0)
-    found = minimise(ROAD, program.window, factor, side, z)
+    active_set[:, :N] = 0 if guess == "middle" else np.where(np.arange(N) % 7 == 0, -1, 0)
+    found = minimise(ROAD, program.window, factor, active_set, z)
     lower, upper = program.bounds()
     x = z[:, :N].ravel()
     assert found == how if guess == "middle" else found in (ACTIVE_SET, NEWTON)
