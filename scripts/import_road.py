@@ -21,15 +21,15 @@ from agents.seeds import KINDS
 from dptse_env.importers import Options, Source, Split, import_trajectories, read_source
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import ROAD
-from dptse_env.importers.network import (
+from dptse_env.importers.report import REPORT, remarks
+from dptse_env.importers.sumo_net import (
     PARAMETERS,
     Files,
     ImportedRoad,
-    find_layout,
     import_road,
     read_configuration,
+    segment_path,
 )
-from dptse_env.importers.report import REPORT, remarks
 from dptse_env.traffic import Corridor, is_road_file, ranges, read_road, write_corridor
 from dptse_env.utils.files import replacing, require_output
 from scripts.cli import Environment
@@ -206,7 +206,7 @@ class Network:
         files = self._files()
         require_output(self.output.parent, [self.output.name], force=self.force)
         ends = self.first_position, self.last_position
-        layout = find_layout(
+        segments = segment_path(
             files,
             edges[::2] if between else edges,
             self.segment_length,
@@ -216,7 +216,7 @@ class Network:
         )
         road = import_road(
             files,
-            layout,
+            segments,
             re.sub(r"[^a-z0-9]+", "-", self.output.stem.lower()).strip("-"),
             self.duration,
             begin=self.begin,
@@ -299,17 +299,17 @@ def print_next(
 
 def describe(road: ImportedRoad) -> str:
     """Describe a road of a network in a few lines."""
-    corridor, layout, network = road.corridor, road.layout, road.corridor.network
+    corridor, segments, network = road.corridor, road.segments, road.corridor.network
     assert network is not None
-    on, off = layout.names[: corridor.n_on_ramps], layout.names[corridor.n_on_ramps :]
-    lengths = layout.lengths
+    on, off = segments.names[: corridor.n_on_ramps], segments.names[corridor.n_on_ramps :]
+    lengths = segments.lengths
     demand = corridor.published_demand
     lines = [
         f"{corridor.name}: from {Path(network.net).name}, seconds {network.begin} to "
         f"{network.begin + corridor.duration}",
         f"{corridor.n_mainline} segments of {min(lengths):.0f} to {max(lengths):.0f} m, "
-        f"{min(layout.lanes)} to {max(layout.lanes)} lanes, "
-        f"{min(layout.limits):.0f} to {max(layout.limits):.0f} km/h",
+        f"{min(segments.lanes)} to {max(segments.lanes)} lanes, "
+        f"{min(segments.limits):.0f} to {max(segments.limits):.0f} km/h",
         f"mainline: {_range(demand.mainline)}",
     ]
     for face, name, rates in zip(corridor.on_ramps, on, demand.ramp_profiles, strict=True):

@@ -45,8 +45,8 @@ from dptse_env.estimators.settings import available_settings, load_settings, wri
 from dptse_env.importers import Layout, Source, import_trajectories
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import Split
-from dptse_env.importers.network import find_layout, import_road, read_configuration
 from dptse_env.importers.source import read_source
+from dptse_env.importers.sumo_net import import_road, read_configuration, segment_path
 from dptse_env.model import ARZParameters, load_parameters
 from dptse_env.model.parameters import write_parameters
 from dptse_env.policies import read_policy, shipped_policies
@@ -59,7 +59,7 @@ from dptse_env.traffic import CORRIDORS, SHORT_HIGHWAY, write_corridor
 from dptse_env.utils.fields import Interval, field_hints
 from tests.hostile import ODD, changed, changed_tensors
 from tests.importers.data import PLAIN, SPLITS, STRAIGHT, plain, stream
-from tests.importers.network.conftest import PATH, motorway
+from tests.importers.sumo_net.conftest import PATH, motorway
 from tests.importers.test_tables import text_of_ngsim
 
 LONGEST = 60.0
@@ -397,7 +397,7 @@ def networks(rng, folder):
 
     def use():
         files = read_configuration(folder / "town.sumocfg")
-        import_road(files, find_layout(files, PATH, 100.0), "motorway", 30)
+        import_road(files, segment_path(files, PATH, 100.0), "motorway", 30)
 
     return path.read_bytes(), use, folder  # what one file lacks another may be blamed for
 

@@ -20,7 +20,7 @@ from matplotlib.image import imsave
 
 from agents.figures import COLOURS, GRID_COLOUR, WIDTH, make_figure, save_figure
 from agents.fitting.page import draw_road
-from dptse_env.importers.network import Files, Layout, find_layout
+from dptse_env.importers.sumo_net import Files, Segmentation, segment_path
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import read_corridor
 from dptse_env.utils.arrays import FloatArray
@@ -38,7 +38,7 @@ def write_files(guide: str, folder: Path) -> None:
         (folder / name).write_text(text, encoding="utf-8")
 
 
-def draw_network(net: Path, layout: Layout) -> Figure:
+def draw_network(net: Path, segments: Segmentation) -> Figure:
     """Draw the lanes of a network in grey, and over them its segments with their numbers."""
     network = sumolib.net.readNet(str(net), withInternal=True)
     figure = make_figure(WIDTH, 2.6, dpi=160)
@@ -48,10 +48,10 @@ def draw_network(net: Path, layout: Layout) -> Figure:
             axis.plot(
                 *np.array(lane.getShape()).T, color=GRID_COLOUR, lw=2.5, solid_capstyle="butt"
             )
-    n, n_ramps = len(layout.lengths), len(layout.names)
+    n, n_ramps = len(segments.lengths), len(segments.names)
     colours = [MAINLINE[number % 2] for number in range(n)] + [RAMP] * n_ramps
     colours += [BOUNDARY] * (2 + n_ramps)
-    for number, (stretches, colour) in enumerate(zip(layout.columns, colours, strict=True)):
+    for number, (stretches, colour) in enumerate(zip(segments.columns, colours, strict=True)):
         lines = [points_of(network.getEdge(edge), low, high) for edge, low, high in stretches]
         for line in lines:
             axis.plot(*line.T, color=colour, lw=4.0, solid_capstyle="butt")
@@ -124,8 +124,8 @@ def draw_guides() -> None:
         command = [str(Path(sys.executable).with_name("netconvert")), *words.split()]
         subprocess.run(command, cwd=folder, check=True, capture_output=True)
         files = Files(folder / "town.net.xml", (folder / "town.rou.xml",))
-        layout = find_layout(files, PATH, SEGMENT_LENGTH, between=True)
-        save_figure(draw_network(files.net, layout), images / "network.png", "")
+        segments = segment_path(files, PATH, SEGMENT_LENGTH, between=True)
+        save_figure(draw_network(files.net, segments), images / "network.png", "")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from dptse_env.utils.registry import needed_for
 with needed_for("an import"):
     from dptse_env.importers.folder import Imported, Split, import_trajectories
     from dptse_env.importers.recording import Options
-    from dptse_env.importers.source import Layout, Part, Source, TrajectoryError, read_source
+    from dptse_env.importers.source import Layout, Source, Strip, TrajectoryError, read_source
     from dptse_env.importers.tables import FORMATS
 
 __all__ = [
@@ -17,9 +17,9 @@ __all__ = [
     "Imported",
     "Layout",
     "Options",
-    "Part",
     "Source",
     "Split",
+    "Strip",
     "TrajectoryError",
     "import_trajectories",
     "read_source",

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dptse_env.importers.placing import Road
+from dptse_env.importers.placing import Branches
 from dptse_env.importers.recording import Options, Recording
 from dptse_env.importers.report import write_report
 from dptse_env.importers.source import Source
@@ -107,7 +107,7 @@ def import_trajectories(
     )
     with new_folder(output) as folder:
         recordings = [
-            Recording(path, Road(bare), source, options, folder.parent / f"file-{number}")
+            Recording(path, Branches(bare), source, options, folder.parent / f"file-{number}")
             for number, path in enumerate(files)
         ]
         windows = [(each, row) for each in recordings for row in each.windows.iter_rows(named=True)]

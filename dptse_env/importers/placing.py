@@ -10,7 +10,7 @@ import polars as pl
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dptse_env.importers.source import Layout, Part
+from dptse_env.importers.source import Layout
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.sumo_input import edge_ids
 from dptse_env.utils.arrays import FloatArray, IntArray
@@ -22,8 +22,8 @@ LINE_SPACING = 0.005
 """Spacing of the points of a centre line by which the nearest one is found [km]."""
 
 
-class Road:
-    """The record columns of a corridor by branch and position."""
+class Branches:
+    """Record columns along the branches of a road: the mainline, then each ramp."""
 
     def __init__(self, corridor: Corridor) -> None:
         """Lay the columns along the road."""
@@ -76,7 +76,7 @@ class Road:
 
 
 def placed(
-    points: pl.LazyFrame, roles: Collection[str], road: Road, layout: Layout, unit: float
+    points: pl.LazyFrame, roles: Collection[str], branches: Branches, layout: Layout, unit: float
 ) -> pl.LazyFrame:
     """Return points with their branch, position [km], record column and number of the lane.
 
@@ -87,23 +87,22 @@ def placed(
     Args:
         points: Points with the columns of `dptse_env.importers.tables.SCHEMA`.
         roles: Those of the columns that the file has.
-        road: The road.
+        branches: Those of the road.
         layout: Where it lies in the data.
         unit: The file's unit of length [km].
 
     Raises:
         ValueError: The layout does not fit the road.
     """
-    corridor = road.corridor
+    corridor = branches.corridor
     for name, n in (("on_ramps", corridor.n_on_ramps), ("off_ramps", corridor.n_off_ramps)):
-        parts = getattr(layout, name)
-        allowed = f"one part for each of the {n} {name.replace('_', '-')} at most"
-        require(len(parts) <= n, f"layout.{name}", allowed, len(parts))
-    for part in (*layout.on_ramps, *layout.off_ramps, layout.mainline):
-        for wanted, role in ((part.names, "lane"), (part.lateral, "y")):
+        strips = getattr(layout, name)
+        allowed = f"one strip for each of the {n} {name.replace('_', '-')} at most"
+        require(len(strips) <= n, f"layout.{name}", allowed, len(strips))
+    for strip in (*layout.on_ramps, *layout.off_ramps, layout.mainline):
+        for wanted, role in ((strip.names, "lane"), (strip.lateral, "y")):
             if wanted and role not in {*roles, *(("y",) if layout.centre_line else ())}:
-                needed = part_in_words(part)
-                raise ValueError(f"layout needs {needed}, and the file has no column of that kind")
+                raise ValueError(f"layout needs {strip}, and the file has no column of that kind")
     lane = pl.col("lane")
     number = pl.when(lane.str.contains(r"^\d{1,8}$")).then(lane).cast(pl.Int32).fill_null(0)
     if layout.centre_line:
@@ -112,35 +111,35 @@ def placed(
         plane = pl.col("plane").struct
         points = points.with_columns(plane=line.project()).with_columns(plane["x"], plane["y"])
     if "edge" in roles and not layout.centre_line:
-        points = points.join(_edges(layout, road), on="edge", how="left").with_columns(
+        points = points.join(_edges(layout, branches), on="edge", how="left").with_columns(
             pl.col("branch").fill_null(OFF), position=pl.col("start") + pl.col("x")
         )
-        column = pl.coalesce("known", column_at(road))
+        column = pl.coalesce("known", column_at(branches))
         return points.with_columns(column=column, lane_number=number)
     position = pl.col("x") - layout.origin * unit
     points = points.with_columns(
         branch=_branch(layout, corridor.n_on_ramps, unit),
         position=-position if layout.reversed else position,
     )
-    return points.with_columns(column=column_at(road), lane_number=number)
+    return points.with_columns(column=column_at(branches), lane_number=number)
 
 
-def column_at(road: Road) -> pl.Expr:
+def column_at(branches: Branches) -> pl.Expr:
     """Return the record column of points by their branch and position."""
 
     def find(both: pl.Series) -> pl.Series:
-        branches, positions = both.struct.unnest()
-        on = branches.fill_null(OFF).to_numpy().astype(np.int16)
-        return pl.Series(road.column(on, positions.fill_null(np.inf).to_numpy()))
+        branch, positions = both.struct.unnest()
+        on = branch.fill_null(OFF).to_numpy().astype(np.int16)
+        return pl.Series(branches.column(on, positions.fill_null(np.inf).to_numpy()))
 
     both = pl.struct("branch", "position")
     return both.map_batches(find, return_dtype=pl.Int16, is_elementwise=True)
 
 
-def _edges(layout: Layout, road: Road) -> pl.LazyFrame:
+def _edges(layout: Layout, branches: Branches) -> pl.LazyFrame:
     """Return branch, start [km] and column of each edge; null for the mainline by position."""
-    names = edge_ids(road.corridor)
-    branches, starts = road.column_starts
+    names = edge_ids(branches.corridor)
+    numbers, starts = branches.column_starts
     edges: list[tuple[str, int, float, int | None]] = []
     for name, value in (layout.edges or {each: each for each in names}).items():
         if not isinstance(value, str):
@@ -148,7 +147,7 @@ def _edges(layout: Layout, road: Road) -> pl.LazyFrame:
             continue
         require(value in names, f"layout.edges.{name}", f"one of {', '.join(names)}", value)
         at = names.index(value)
-        edges.append((name, int(branches[at]), float(starts[at]), at))
+        edges.append((name, int(numbers[at]), float(starts[at]), at))
     kinds = {"edge": pl.String, "branch": pl.Int16, "start": pl.Float64, "known": pl.Int16}
     return pl.LazyFrame(edges, kinds, orient="row")
 
@@ -157,24 +156,17 @@ def _branch(layout: Layout, n_on_ramps: int, unit: float) -> pl.Expr:
     """Return the branch by lanes and lateral positions; the mainline takes what no ramp has."""
     ramps = [*enumerate(layout.on_ramps, 1), *enumerate(layout.off_ramps, 1 + n_on_ramps)]
     found = pl.lit(OFF, pl.Int16)
-    for number, part in reversed([*ramps, (0, layout.mainline)]):
-        if number and not part.names and part.lateral is None:
+    for number, strip in reversed([*ramps, (0, layout.mainline)]):
+        if number and not strip.names and strip.lateral is None:
             continue  # a ramp that the data does not show
         here = pl.lit(True)
-        if part.names:
-            here &= pl.col("lane").is_in(sorted(part.names)).fill_null(False)
-        if part.lateral is not None:
-            low, high = (bound * unit for bound in part.lateral)
+        if strip.names:
+            here &= pl.col("lane").is_in(sorted(strip.names)).fill_null(False)
+        if strip.lateral is not None:
+            low, high = (bound * unit for bound in strip.lateral)
             here &= pl.col("y").is_between(low, high, closed="left").fill_null(False)
         found = pl.when(here).then(pl.lit(number, pl.Int16)).otherwise(found)
     return found
-
-
-def part_in_words(part: Part) -> str:
-    """Describe a part of the road for messages."""
-    lanes = f"lanes {', '.join(map(str, part.lanes))}" if part.lanes else ""
-    lateral = f"lateral positions {part.lateral}" if part.lateral else ""
-    return " and ".join(filter(None, (lanes, lateral))) or "all other vehicles"
 
 
 class _Line:

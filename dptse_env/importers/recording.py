@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 
 from dptse_env.importers import tables
-from dptse_env.importers.placing import OFF, Road, part_in_words, placed
+from dptse_env.importers.placing import OFF, Branches, placed
 from dptse_env.importers.resampling import (
     TIME_UNIT,
     check_pieces,
@@ -78,7 +78,7 @@ class Recording:
 
     Attributes:
         path: The file.
-        road: The road.
+        branches: Those of the road.
         source: What the file means.
         options: How trajectories are cut.
         folder: Where its points wait.
@@ -92,7 +92,7 @@ class Recording:
     """
 
     path: Path
-    road: Road
+    branches: Branches
     source: Source
     options: Options
     folder: Path
@@ -133,7 +133,7 @@ class Recording:
         )
         found = rows.collect()
         found = found.join(_numbers(found), ["id", "piece"], "left", maintain_order="left")
-        corridor = self.road.corridor
+        corridor = self.branches.corridor
         return Record(
             step=found["step"].to_numpy(),
             vehicle=found["number"].to_numpy(),
@@ -149,7 +149,7 @@ class Recording:
         time = pl.col("time") + (self.shift - start)
         here = (pl.col("branch") == 0) & (pl.col("column") != OFF) & (pl.col("group") == group)
         points = (
-            self._points.filter(here, time.is_between(0.0, self.road.corridor.duration))
+            self._points.filter(here, time.is_between(0.0, self.branches.corridor.duration))
             .select(time, "position", "speed")
             .collect(engine="streaming")
         )
@@ -166,7 +166,7 @@ class Recording:
                 check_units(moves, self.source, self._units, str(self.path), whole=False)
             unit = self.source.factor("length", self._form.units["length"])
             n_buckets = min(1 + n_rows // BUCKET_ROWS, MOST_BUCKETS)
-            points = placed(points, roles, self.road, layout, unit).select(
+            points = placed(points, roles, self.branches, layout, unit).select(
                 "row", "time", "vehicle", "position", "speed", "branch", "column", "lane_number",
                 "bad", c("group").fill_null(""),
                 off=pl.when(c("branch") == OFF).then(pl.coalesce("edge", "lane")),
@@ -246,7 +246,7 @@ class Recording:
             f"{self.path}: rows must be on the road, got {counts['off_ends']} of {counts['rows']} "
             f"before its start or beyond its end, and {counts['off_lanes']} on other lanes or "
             f"edges{f' (such as {names})' if names else ''} than layout says: "
-            f"{part_in_words(self.source.layout.mainline)}"
+            f"{self.source.layout.mainline}"
         )
 
     def _time_shift(self, seconds: pl.DataFrame) -> float:
@@ -305,7 +305,7 @@ class Recording:
 
         A silence parts a group into recordings. Those that are shorter than a window have none.
         """
-        c, stride = pl.col, self.road.corridor.duration + 1 + self.options.pause
+        c, stride = pl.col, self.branches.corridor.duration + 1 + self.options.pause
         wait = c("begin") - c("end").shift()
         pauses = wait.is_between(LONGEST_PAUSE, LONGEST_SILENCE).over("group")
         part = (c("second").diff() > LONGEST_SILENCE).fill_null(False).cum_sum().over("group")
@@ -344,7 +344,7 @@ class Recording:
             longest = (parts["last"] - parts["first"]).to_numpy().max() + 1
             silences = f" between silences of over {LONGEST_SILENCE:g} s" if len(parts) > 1 else ""
             raise TrajectoryError(
-                f"{self.path}: it must last {self.road.corridor.duration + 1} s or more, the "
+                f"{self.path}: it must last {self.branches.corridor.duration + 1} s or more, the "
                 f"corridor's duration and a second, got {longest:.0f} s{silences} (time in "
                 f"{self._units['time']})"
             )
@@ -392,16 +392,16 @@ class Recording:
         self._stretches.append(stretches(points, self.options.longest_gap))
         self._earlier.append(earlier(points, self.options.longest_gap))
         found, pieces = whole_seconds(
-            points, self.road, self.options.longest_gap, self.counts, str(self.path)
+            points, self.branches, self.options.longest_gap, self.counts, str(self.path)
         )
-        self.counts.update(count_ends(pieces, coverage, self.road))
+        self.counts.update(count_ends(pieces, coverage, self.branches))
         since = (c("second") - c("first")).alias("step")
         found = (
             found.sort("second", maintain_order=True)
             .join_asof(
                 self.windows, left_on="second", right_on="first", by="group", check_sortedness=False
             )
-            .filter(c("window").is_not_null(), since <= self.road.corridor.duration)
+            .filter(c("window").is_not_null(), since <= self.branches.corridor.duration)
             .with_columns(since)
             .join(labels, "id", maintain_order="left")
         )

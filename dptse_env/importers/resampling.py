@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 import polars as pl
 
-from dptse_env.importers.placing import Road
+from dptse_env.importers.placing import Branches
 from dptse_env.importers.source import Source, TrajectoryError
 from dptse_env.importers.units import Motion, check_units
 from dptse_env.utils.arrays import FloatArray, IntArray
@@ -32,7 +32,7 @@ HALF_WIDTH = 0.5
 
 
 def whole_seconds(
-    points: pl.DataFrame, road: Road, longest_gap: float, counts: Counter[str], where: str
+    points: pl.DataFrame, branches: Branches, longest_gap: float, counts: Counter[str], where: str
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Return vehicles at whole seconds, and a row for each piece of a trajectory.
 
@@ -40,7 +40,7 @@ def whole_seconds(
         points: All points on the road of some vehicles: row, id (whole numbers), vehicle (the
             file's name for it), time [s], position [km], speed [km/h] (null to derive it), branch,
             column, lane_number, group.
-        road: The road that they are on.
+        branches: Those of the road that they are on.
         longest_gap: Longest time without points that is filled by interpolation [s].
         counts: What happens is added to it.
         where: The file, for messages.
@@ -96,7 +96,7 @@ def whole_seconds(
     )
     at = rows.filter("changed").select(c("nearer"), c("position"))
     column = rows["column"].to_numpy().copy()
-    column[rows["changed"].to_numpy()] = road.column(*(each.to_numpy() for each in at))
+    column[rows["changed"].to_numpy()] = branches.column(*(each.to_numpy() for each in at))
     speed = rows["speed"].to_numpy()
     if points["speed"].null_count():
         speed = _derived(points, rows["place"].to_numpy(), rows["second"].to_numpy())
@@ -331,15 +331,15 @@ def _pieces(points: pl.DataFrame, counts: Counter[str]) -> pl.DataFrame:
 
 
 def count_ends(
-    pieces: pl.DataFrame, coverage: Mapping[str, tuple[float, float]], road: Road
+    pieces: pl.DataFrame, coverage: Mapping[str, tuple[float, float]], branches: Branches
 ) -> Counter[str]:
     """Count where the pieces of trajectories begin and end: at an entry, or amid the road."""
-    road_ = road.corridor
-    n, first, n_on = road_.n_mainline, road_.n_segments, road_.n_on_ramps
+    road = branches.corridor
+    n, first, n_on = road.n_mainline, road.n_segments, road.n_on_ramps
     before = range(first + 2, first + 2 + n_on)
-    after = range(first + 2 + n_on, first + 2 + road_.n_ramps)
-    entries = [0, first, *itertools.chain(*road_.on_ramp_segments), *before]
-    exits = [n - 1, first + 1, *itertools.chain(*road_.off_ramp_segments), *after]
+    after = range(first + 2 + n_on, first + 2 + road.n_ramps)
+    entries = [0, first, *itertools.chain(*road.on_ramp_segments), *before]
+    exits = [n - 1, first + 1, *itertools.chain(*road.off_ramp_segments), *after]
     first_time, last_time = (
         pl.col("group").replace_strict({g: c[i] for g, c in coverage.items()}) for i in (0, 1)
     )

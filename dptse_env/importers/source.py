@@ -30,7 +30,7 @@ UNITS = {"time": TIMES, "length": LENGTHS, "speed": SPEEDS}
 NUMBERS = ("time", "x", "y", "speed", "extent")
 LABELS = ("vehicle", "lane", "edge", "group")
 ROLES = NUMBERS + LABELS
-"""Roles of columns. ``x`` is the position along the road, along an ``edge`` of a network, or, with
+"""Roles of columns. ``x`` is the position along the road, along an ``edge`` of a SUMO net, or, with
 ``y``, in the plane; else ``y`` is lateral. ``extent`` is the length of a vehicle along ``x``, for
 data in which ``x`` is a corner of its box. A ``group`` is a road of its own in the file, such as a
 driving direction."""
@@ -41,8 +41,8 @@ class TrajectoryError(ValueError):
 
 
 @dataclass(frozen=True)
-class Part:
-    """Criteria for vehicles on a part of the road; without any, all other vehicles are on it.
+class Strip:
+    """A strip of the road; one without lanes and range has all vehicles that no other has.
 
     Attributes:
         lanes: names of its lanes.
@@ -56,6 +56,12 @@ class Part:
     def names(self) -> frozenset[str]:
         """Names of the lanes as text."""
         return frozenset(map(str, self.lanes))
+
+    def __str__(self) -> str:
+        """Describe it for messages."""
+        lanes = f"lanes {', '.join(map(str, self.lanes))}" if self.lanes else ""
+        lateral = f"lateral positions {self.lateral}" if self.lateral else ""
+        return " and ".join(filter(None, (lanes, lateral))) or "all other vehicles"
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,7 @@ class Layout:
         on_ramps: the same for each on-ramp. A ramp's vehicles count as the mainline's from its
             face on.
         off_ramps: the same for each off-ramp, whose vehicles count as the mainline's before it.
-        edges: for data by edges of a network, where each edge lies: the name of a record column
+        edges: for data by edges of a SUMO net, where each edge lies: the name of a record column
             (``main_3``, ``on_0``, ``upstream``, ``before_on_0``, ...), or the kilometre of the
             mainline at which the edge starts. By default edges have the names of the columns.
     """
@@ -81,9 +87,9 @@ class Layout:
     reversed: bool = False
     extent: float | None = None
     centre_line: tuple[tuple[float, float], ...] = ()
-    mainline: Part = field(default_factory=Part)
-    on_ramps: tuple[Part, ...] = ()
-    off_ramps: tuple[Part, ...] = ()
+    mainline: Strip = field(default_factory=Strip)
+    on_ramps: tuple[Strip, ...] = ()
+    off_ramps: tuple[Strip, ...] = ()
     edges: dict = field(default_factory=dict)  # type: ignore[type-arg]
 
     def __post_init__(self) -> None:

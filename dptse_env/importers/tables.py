@@ -80,7 +80,7 @@ class Format:
     sumo: bool = False
 
 
-class Points(NamedTuple):
+class Table(NamedTuple):
     """A file of trajectories.
 
     Attributes:
@@ -102,7 +102,7 @@ class _Raw(NamedTuple):
     grouped: bool = False
 
 
-def scan(path: Path, form: Format, source: Source) -> Points:
+def scan(path: Path, form: Format, source: Source) -> Table:
     """Return the points of a file, which is read when they are collected.
 
     Raises:
@@ -131,7 +131,7 @@ def scan(path: Path, form: Format, source: Source) -> Points:
         # Rows without a vehicle tell times alone.
         raw = raw.filter(columns["vehicle"].is_null() | _equals(found, value))
     layout, lane = source.layout, columns.get("lane")
-    wanted = [part.names for part in (layout.mainline, *layout.on_ramps, *layout.off_ramps)]
+    wanted = [strip.names for strip in (layout.mainline, *layout.on_ramps, *layout.off_ramps)]
     names_of_lanes = sorted(frozenset().union(*wanted))
     for name, code in zip(names_of_lanes, codes(names_of_lanes), strict=True):
         if lane is not None and code != name:  # as the layout spells it, "01"
@@ -153,7 +153,7 @@ def scan(path: Path, form: Format, source: Source) -> Points:
         points = points.with_columns(lane=pl.col("lane").str.extract("([^_]*)$"))
     if form.adjust:
         points = form.adjust(points, path, source)
-    return Points(points, set(roles), rows)
+    return Table(points, set(roles), rows)
 
 
 def field_text(path: Path, form: Format, source: Source, row: int, role: str) -> tuple[str, str]:

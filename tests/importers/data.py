@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dptse_env.importers import Options, Source, Split, import_trajectories
-from dptse_env.importers.placing import Road
+from dptse_env.importers.placing import Branches
 from dptse_env.traffic import Corridor, Demand
 
 ROAD = Corridor(
@@ -83,7 +83,7 @@ def driven(record, corridor, period=0.5):
     They drive from where they enter at the speeds of the record. Positions on ramps are those of
     the face that they join or leave, minus or plus the distance to it, as the importers have them.
     """
-    starts = Road(corridor).column_starts[1]
+    starts = Branches(corridor).column_starts[1]
     points = []
     for vehicle in np.unique(record.vehicle):
         own = record.vehicle == vehicle

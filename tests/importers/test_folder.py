@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dptse_env.importers import Layout, Part, Source
+from dptse_env.importers import Layout, Source, Strip
 from dptse_env.importers.folder import assign_seeds
 from tests.importers.data import PLAIN, ROAD, SPLITS, plain, run, stream
 
@@ -32,14 +32,14 @@ def test_every_split_has_a_window_if_it_can():
 
 def test_other_errors_name_the_option(tmp_path):
     path = plain(tmp_path / "a.csv", stream())
-    lanes = Part(lanes=(1,))
+    lanes = Strip(lanes=(1,))
     for message, arguments in {
         "shares must be": {"splits": [SPLITS[0]._replace(share=0.5)]},
         "at most 1 windows of split training, got 3": {
             "splits": [SPLITS[0]._replace(seeds=range(1)), *SPLITS[1:]]
         },
         r"source\.format must be one of fcd, ngsim": {"source": Source("csv")},
-        r"layout\.on_ramps must be one part for each of the 0": {
+        r"layout\.on_ramps must be one strip for each of the 0": {
             "source": dataclasses.replace(PLAIN, layout=Layout(on_ramps=(lanes,)))
         },
         r"layout needs lanes": {
@@ -83,7 +83,7 @@ def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
 
 def test_a_mainline_that_nobody_drives_on_is_told(tmp_path):
     points = stream(length=250.0)
-    lanes = Layout(mainline=Part(lanes=(1,)), on_ramps=(Part(lanes=(7,)),))
+    lanes = Layout(mainline=Strip(lanes=(1,)), on_ramps=(Strip(lanes=(7,)),))
     source = Source("table", {**PLAIN.columns, "lane": "lane"}, layout=lanes)
     with pytest.warns(UserWarning, match=r"on the mainline's segments 4 of 4: are layout\.origin"):
         told = run(
@@ -106,7 +106,7 @@ def test_windows_that_begin_empty_are_told(tmp_path):
     early = points[:, 1] < 5.0
     kept = ~early | (points[:, 2] < 90.0)  # at first all are on the ramp, which joins at 100 m
     path = plain(tmp_path / "a.csv", points[kept], lane=np.where(early, 7, 1)[kept])
-    lanes = Layout(mainline=Part(lanes=(1,)), on_ramps=(Part(lanes=(7,)),))
+    lanes = Layout(mainline=Strip(lanes=(1,)), on_ramps=(Strip(lanes=(7,)),))
     source = Source("table", {**PLAIN.columns, "lane": "lane"}, layout=lanes)
     notes = run(path, source, ROAD).report["notes"]
     assert "windows begin on an empty mainline: traffic seeds 0" in notes

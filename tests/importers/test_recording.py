@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError, recording
+from dptse_env.importers import Layout, Source, Split, Strip, TrajectoryError, recording
 from dptse_env.importers.report import remarks
 from dptse_env.traffic import RecordLibrary
 from tests.importers.data import PLAIN, ROAD, first_file, plain, run, stream, write_csv
@@ -190,7 +190,7 @@ def test_codes_that_are_one_number_are_one(text, tmp_path):
         codes = [write.format(1 + int(vehicle) % 2) for vehicle in points[:, 0]]
         source = dataclasses.replace(
             PLAIN, columns={**PLAIN.columns, "lane": "lane", "group": "side"}, where={"site": 1},
-            groups=(1,), layout=Layout(mainline=Part(lanes=wanted)),
+            groups=(1,), layout=Layout(mainline=Strip(lanes=wanted)),
         )  # fmt: skip
         path = plain(subfolder(tmp_path, name), points, lane=codes, side=codes, site=codes)
         counts.append(record_of(run(path, source)).counts)
@@ -204,7 +204,7 @@ def test_what_is_left_out_is_told(tmp_path):
     paused = points[(points[:, 1] < 50.0) | (points[:, 1] > 90.0)]
     names = ["nan" if i < 3 else int(vehicle) for i, vehicle in enumerate(paused[:, 0])]
     lanes = np.where(paused[:, 0] == 5, 9, 1)
-    source = dataclasses.replace(WITH_LANES, layout=Layout(mainline=Part(lanes=(1,))))
+    source = dataclasses.replace(WITH_LANES, layout=Layout(mainline=Strip(lanes=(1,))))
     told = remarks(first_file(run(plain(tmp_path / "a.csv", paused, id=names, lane=lanes), source)))
     assert told[0] == "3 other rows, dropped: without a vehicle's id"
     assert told[1].startswith(f"{(lanes == 9).sum()} dropped: on other lanes")
@@ -231,8 +231,8 @@ def test_ramps_are_told_by_lanes_or_lateral_positions(tmp_path):
     lane = np.where(on, 7, np.where(off, 8, 1))
     counts = []
     for role, parts in {
-        "lane": (Part(lanes=(7,)), Part(lanes=(8,)), Part(lanes=(1,))),
-        "y": (Part(lateral=(30, 37)), Part(lateral=(37, 45)), Part(lateral=(-3, 3))),
+        "lane": (Strip(lanes=(7,)), Strip(lanes=(8,)), Strip(lanes=(1,))),
+        "y": (Strip(lateral=(30, 37)), Strip(lateral=(37, 45)), Strip(lateral=(-3, 3))),
     }.items():
         layout = Layout(on_ramps=parts[:1], off_ramps=parts[1:2], mainline=parts[2])
         source = Source("table", {**PLAIN.columns, role: role}, layout=layout)
@@ -333,7 +333,7 @@ def test_rows_off_the_road_are_dropped_and_counted(tmp_path):
     points = stream()
     lane = np.where(points[:, 0] == 3, 9, 1)
     points[points[:, 0] == 5, 2] += 1000.0
-    source = dataclasses.replace(WITH_LANES, layout=Layout(mainline=Part(lanes=(1,))))
+    source = dataclasses.replace(WITH_LANES, layout=Layout(mainline=Strip(lanes=(1,))))
     file = first_file(run(plain(tmp_path / "a.csv", points, lane=lane), source))
     assert file["off_lanes"] == (points[:, 0] == 3).sum()
     assert file["off_ends"] == (points[:, 0] == 5).sum()

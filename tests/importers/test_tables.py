@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from dptse_env.importers import Layout, Part, Source, Split, TrajectoryError, import_trajectories
+from dptse_env.importers import Layout, Source, Split, Strip, TrajectoryError, import_trajectories
 from dptse_env.importers.tables import NGSIM_COLUMNS
 from dptse_env.traffic import SHORT_HIGHWAY, Record, RecordLibrary, simulate, sumo
 from dptse_env.traffic.sumo_input import edge_ids
@@ -135,7 +135,7 @@ def test_exid_has_frames_lanelets_in_lists_and_a_plane(tmp_path, expected):
         "lonVelocity": speed, "laneletId": ["1500;1502" if s > 200 else "1500" for s in x],
     }  # fmt: skip
     line = ((100.0, -50.0), (340.0, -370.0))
-    layout = Layout(centre_line=line, mainline=Part(lanes=(1500, 1501)))
+    layout = Layout(centre_line=line, mainline=Strip(lanes=(1500, 1501)))
     imported = run(write_csv(tmp_path / "07_tracks.csv", columns), Source("exid", layout=layout))
     np.testing.assert_array_equal(counts(imported), expected)
     assert imported.report["windows"][0]["group"] == "7"

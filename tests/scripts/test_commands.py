@@ -26,7 +26,7 @@ from scripts import info
 from scripts.dptse import MODULES
 from tests.helpers import ROOT, SHORT, fast_and_slow, save_untrained
 from tests.importers.data import plain, stream
-from tests.importers.network.conftest import motorway
+from tests.importers.sumo_net.conftest import motorway
 from tests.scripts.commands import refused, run_command
 from tests.scripts.test_policy import save_model
 

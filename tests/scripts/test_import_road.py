@@ -15,7 +15,7 @@ from dptse_env.traffic import Demand, RecordLibrary, read_corridor
 from tests.agents.test_measured_field import source
 from tests.helpers import ROOT, make_env
 from tests.importers.data import STRAIGHT, driven, plain, stream, write_csv
-from tests.importers.network.conftest import PATH, motorway, netconvert
+from tests.importers.sumo_net.conftest import PATH, motorway, netconvert
 from tests.importers.test_tables import FOOT, ngsim
 from tests.scripts.commands import refused, run_command
 

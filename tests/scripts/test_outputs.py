@@ -16,7 +16,7 @@ from scripts import import_road, policy
 from scripts.dptse import MODULES
 from tests.helpers import SHORT, fast_and_slow
 from tests.importers.data import plain, stream
-from tests.importers.network.conftest import motorway
+from tests.importers.sumo_net.conftest import motorway
 from tests.scripts.commands import refused, run_command
 from tests.scripts.test_import_road import on
 from tests.scripts.test_train_estimator import SMALL
@@ -72,7 +72,7 @@ def test_a_place_where_results_cannot_go_is_refused_before_any_work(name, tmp_pa
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("DPTSE_CACHE", str(tmp_path / "cache"))
     for where, work in (
-        (library, "record_seeds"), (policy, "_unpickled"), (import_road, "find_layout"),
+        (library, "record_seeds"), (policy, "_unpickled"), (import_road, "segment_path"),
         (folder, "Recording"), (FieldSource, "read"),
     ):  # fmt: skip
         monkeypatch.setattr(where, work, begin)

@@ -1,4 +1,4 @@
-"""A corridor made of a layout, with the demand and the exit shares of one simulated run."""
+"""A corridor made of a segmentation, with the demand and the exit shares of one simulated run."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dptse_env.importers.network.configuration import Files
-from dptse_env.importers.network.layout import Layout
+from dptse_env.importers.sumo_net.configuration import Files
+from dptse_env.importers.sumo_net.segmentation import Segmentation
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, Profile
 from dptse_env.traffic.own_sumo import SumoScenario
@@ -32,24 +32,24 @@ LEAST_SHARE = 0.001
 
 @dataclass(frozen=True)
 class ImportedRoad:
-    """A road of a SUMO network.
+    """A road of a SUMO net.
 
     Attributes:
         corridor: the road, with demand, exit shares and average dwell counted in `record`.
-        layout: where its segments are in the network.
+        segments: where its segments are in the net.
         record: the run that was counted.
         remarks: what was unusual, for people.
     """
 
     corridor: Corridor
-    layout: Layout
+    segments: Segmentation
     record: Record
     remarks: tuple[str, ...]
 
 
 def import_road(
     files: Files,
-    layout: Layout,
+    segments: Segmentation,
     name: str,
     duration: int,
     begin: int | None = None,
@@ -57,11 +57,11 @@ def import_road(
     speed_limit: float | None = None,
     seed: int = 0,
 ) -> ImportedRoad:
-    """Make a corridor of a layout, and count its demand in one simulated run.
+    """Make a corridor of a segmentation, and count its demand in one simulated run.
 
     Args:
         files: what the simulation reads.
-        layout: the segments.
+        segments: the segments.
         name: name of the corridor.
         duration: length of a record [s].
         begin: second of SUMO's clock at which a record starts; that of `files` after the warm-up
@@ -77,9 +77,9 @@ def import_road(
     if begin is None:
         require(float(files.begin).is_integer(), "begin", "whole seconds", files.begin)
         begin = int(files.begin) + warm_up
-    remarks = [*layout.remarks, *files.check(begin - warm_up)]
+    remarks = [*segments.remarks, *files.check(begin - warm_up)]
     try:
-        draft = _draft(files, layout, name, duration, begin, warm_up, speed_limit)
+        draft = _draft(files, segments, name, duration, begin, warm_up, speed_limit)
     except ValueError as problem:
         raise ValueError(f"net: {files.net}: {problem}") from problem
     try:
@@ -110,12 +110,12 @@ def import_road(
         remarks.append(f"{share} appear on the mainline, past every entrance")
     if not record.counts[0, : draft.n_mainline].any():
         remarks.append("the record begins on an empty mainline; a warm-up fills it")
-    remarks += [f"no vehicle {text}" for text in _unused(draft, layout.names, first)]
+    remarks += [f"no vehicle {text}" for text in _unused(draft, segments.names, first)]
     remarks.append(
         "fixed sensors are assumed on the last mainline segment and on off-ramps: "
         f"fixed_sensors = {list(draft.fixed_sensors)}"
     )
-    return ImportedRoad(corridor, layout, record, tuple(remarks))
+    return ImportedRoad(corridor, segments, record, tuple(remarks))
 
 
 def _unused(corridor: Corridor, names: Sequence[str], first: IntArray) -> Iterator[str]:
@@ -131,7 +131,7 @@ def _unused(corridor: Corridor, names: Sequence[str], first: IntArray) -> Iterat
 
 def _draft(
     files: Files,
-    layout: Layout,
+    segments: Segmentation,
     name: str,
     duration: int,
     begin: int,
@@ -149,35 +149,35 @@ def _draft(
         routes=names[1 : 1 + n_routes],
         additional=names[1 + n_routes :],
         sha256=tuple(file_digest(path) for path in paths),
-        columns=layout.columns,
+        columns=segments.columns,
         folder=str(folder),
         begin=begin,
         warm_up=warm_up,
         step_length=files.step_length,
         options=files.options,
     )
-    N, n_on, n_off = len(layout.lengths), len(layout.on_ramps), len(layout.off_ramps)
+    N, n_on, n_off = map(len, (segments.lengths, segments.on_ramps, segments.off_ramps))
     limits, ramp_limits = (
         tuple(round(each if speed_limit is None else speed_limit, 1) for each in of_edges)
-        for of_edges in (layout.limits, layout.ramp_limits)
+        for of_edges in (segments.limits, segments.ramp_limits)
     )
     return Corridor(
         name=name,
         n_mainline=N,
-        on_ramps=layout.on_ramps,
-        off_ramps=layout.off_ramps,
+        on_ramps=segments.on_ramps,
+        off_ramps=segments.off_ramps,
         exit_shares=(0.5,) * n_off,
         demand=Demand(mainline=((0.0, 0.0),), on_ramps=(0.0,) * n_on),
         incident=None,
         fixed_sensors=(N - 1, *(N + n_on + i for i in range(n_off))),
         duration=duration,
-        lanes=layout.lanes,
-        ramp_lanes=layout.ramp_lanes or 1,
-        segment_length=_kilometres(layout.lengths),
+        lanes=segments.lanes,
+        ramp_lanes=segments.ramp_lanes or 1,
+        segment_length=_kilometres(segments.lengths),
         speed_limit=limits,
-        ramp_length=_kilometres(layout.ramp_lengths) or None,
+        ramp_length=_kilometres(segments.ramp_lengths) or None,
         ramp_speed_limit=ramp_limits or None,
-        density_scale=DENSITY_SCALE * max(layout.lanes),
+        density_scale=DENSITY_SCALE * max(segments.lanes),
         speed_scale=max(limits),
         network=network,
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from dptse_env.importers.network.net import root_of
+from dptse_env.importers.sumo_net.net import root_of
 from dptse_env.traffic.own_sumo import TRAFFIC, UNREADABLE, clock, copy_input, open_xml
 from dptse_env.utils.fields import shown
 
@@ -33,7 +33,7 @@ class Files:
     """Files and options of a simulation.
 
     Attributes:
-        net: network file.
+        net: net file.
         routes: route files.
         additional: additional files.
         begin: second of SUMO's clock at which it begins.
@@ -99,7 +99,7 @@ def read_configuration(path: Path) -> Files:
     """Return what a configuration file names; names of files are relative to its folder.
 
     Raises:
-        ValueError: It cannot be read, is no configuration, or names no network.
+        ValueError: It cannot be read, is no configuration, or names no net.
     """
     where = f"configuration: {path}"
     root = root_of(path, "configuration")

@@ -1,4 +1,4 @@
-"""Networks of SUMO, as `sumolib` reads them: edges that are open to cars, and paths along them."""
+"""SUMO nets, as `sumolib` reads them: edges that are open to cars, and paths along them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dptse_env.traffic.own_sumo import UNREADABLE, open_xml
 from dptse_env.utils.fields import shown
 
 NEWEST_VERSION = (1, 20)
-"""Newest version of network files that the supported release of SUMO reads."""
+"""Newest version of net files that the supported release of SUMO reads."""
 
 VEHICLE_CLASS = "passenger"
 """Lanes that this class may not use (bus lanes, hard shoulders, pavements) do not count."""
@@ -24,15 +24,15 @@ _BROKEN = (*UNREADABLE, OSError, SAXException, AttributeError, TypeError)
 
 
 class Net:
-    """A network of SUMO.
+    """A SUMO net.
 
     Args:
-        path: the network file, plain or gzipped.
+        path: the net file, plain or gzipped.
         internal_links: whether vehicles drive on the internal edges of junctions; False for a
             simulation with ``--no-internal-links``.
 
     Attributes:
-        path: the network file.
+        path: the net file.
         edges: edges by id, without internal ones.
 
     Raises:
@@ -45,18 +45,18 @@ class Net:
 
         root = root_of(path, "net")
         if root.tag != "net":
-            raise ValueError(f"net: {path} must be a network (<net>), got <{root.tag:.60}>")
+            raise ValueError(f"net: {path} must be a SUMO net (<net>), got <{root.tag:.60}>")
         _check_version(path, root.get("version", ""))
         try:
             self._net: Any = readNet(str(path), withInternal=internal_links)
             edges = self._net.getEdges(withInternal=False)
         except _BROKEN as error:
             problem = f"{type(error).__name__}: {error}"[:200]
-            raise ValueError(f"net: {path} must be a network of SUMO, got {problem}") from error
+            raise ValueError(f"net: {path} must be a SUMO net, got {problem}") from error
         self.path, self._internal_links = path, internal_links
         self.edges: dict[str, Any] = {edge.getID(): edge for edge in edges}
         if not self.edges:
-            raise ValueError(f"net: {path} must have edges, got a network without any")
+            raise ValueError(f"net: {path} must have edges, got a net without any")
 
     def edge(self, name: str, where: str) -> Any:
         """Return an edge.
@@ -191,7 +191,7 @@ def root_of(path: Path, where: str) -> ElementTree.Element:
 
 
 def _check_version(path: Path, version: str) -> None:
-    """Check that a network is of a version that can be read."""
+    """Check that a net is of a version that can be read."""
     try:
         numbers = tuple(int(part) for part in version.split(".")[:2])
     except ValueError as error:

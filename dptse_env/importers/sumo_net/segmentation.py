@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from dptse_env.importers.network.configuration import Files
-from dptse_env.importers.network.net import (
+from dptse_env.importers.sumo_net.configuration import Files
+from dptse_env.importers.sumo_net.net import (
     VEHICLE_CLASS,
     Net,
     connections,
@@ -34,14 +34,10 @@ LONGEST = 1e6
 SECONDS_ON_SEGMENT = 1.2
 """Least time of a free crossing of a segment [s]: the traffic model's step is one second."""
 
-Ends = tuple[float, float | None]
-"""Positions [m] on the first edge of a path, where the road begins, and on the last, where it ends;
-None for the end of that edge."""
-
 
 @dataclass(frozen=True)
-class Layout:
-    """The segments of a road, and where they are in the network.
+class Segmentation:
+    """The segments of a road, and where they are in the net.
 
     Attributes:
         lengths: (N,) length of each mainline segment [m].
@@ -54,7 +50,7 @@ class Layout:
             or leaves.
         ramp_limits: speed limit of each ramp [km/h], on-ramps first.
         columns: stretches of each record column.
-        names: what each ramp is in the network, on-ramps first.
+        names: what each ramp is in the net, on-ramps first.
         remarks: what was unusual, for people.
     """
 
@@ -71,15 +67,15 @@ class Layout:
     remarks: tuple[str, ...]
 
 
-def find_layout(
+def segment_path(
     files: Files,
     path: Sequence[str],
     segment_length: float,
     between: bool = False,
     left_out: Collection[str] = (),
-    ends: Ends = (0.0, None),
-) -> Layout:
-    """Cut a path of a network into segments, and find its ramps.
+    ends: tuple[float, float | None] = (0.0, None),
+) -> Segmentation:
+    """Cut a path of a net into segments, and find its ramps.
 
     The path is cut at every junction with a ramp, and between two of them into equal parts that are
     as near to the wanted length as possible. The first and the last part of the path are the
@@ -89,15 +85,16 @@ def find_layout(
     its length, rounded.
 
     Args:
-        files: what the simulation reads; of these only the network is read here.
+        files: what the simulation reads; of these only the net is read here.
         path: ids of the path's edges, or of its first and last with `between`.
         segment_length: wanted length of a segment [m].
         between: take the shortest path between the two edges of `path`.
         left_out: edges at the path that are no ramps; their vehicles appear and vanish.
-        ends: positions on the first and the last edge at which the road begins and ends.
+        ends: positions [m] on the first edge, where the road begins, and on the last, where it
+            ends; None for the end of that edge.
 
     Raises:
-        ValueError: The network or the path is of no use, a position is not on its edge, the path is
+        ValueError: The net or the path is of no use, a position is not on its edge, the path is
             too short, or ramps are too near to one another or to its ends; the message names the
             file or the field.
     """
@@ -118,7 +115,7 @@ def find_layout(
     sides = list(zip(ramps, faces, lengths, strict=True))
     if left_out:
         merged.append(f"left out: {', '.join(left_out)}; vehicles that take them appear and vanish")
-    return Layout(
+    return Segmentation(
         lengths=tuple(end - start for start, end in parts),
         lanes=lanes,
         limits=tuple(chain.limit(start, end) for start, end in parts),
@@ -139,7 +136,7 @@ def find_layout(
 
 
 @dataclass(frozen=True)
-class _Part:
+class _PlacedEdge:
     """An edge, or one of the internal edges of a crossing, at a distance along a chain.
 
     Attributes:
@@ -170,7 +167,7 @@ class Chain:
     several ways over a junction, they lie side by side over the mean of their lengths.
 
     Args:
-        net: the network.
+        net: the net.
         edges: the edges, in the direction of travel.
         onto: an edge that follows them; the crossing to it then belongs to the chain.
 
@@ -185,7 +182,7 @@ class Chain:
     def __init__(self, net: Net, edges: Sequence[Any], onto: Any = None) -> None:
         """Measure the edges."""
         self.edges, self.ends = list(edges), [0.0]
-        self._parts: list[_Part] = []
+        self._parts: list[_PlacedEdge] = []
         for edge, after in zip(edges, [*edges[1:], onto], strict=True):
             end = self._add(net, edge, self.ends[-1], edge.getLength())
             ways = net.crossing(edge, after) if after is not None else []
@@ -212,7 +209,7 @@ class Chain:
                     f"net: {net.path}: lane {shown(name)} must have {allowed}, got {found}"
                 )
         longest = max(float(lane.getLength()) for lane in edge.getLanes())
-        self._parts.append(_Part(edge.getID(), start, start + length, longest))
+        self._parts.append(_PlacedEdge(edge.getID(), start, start + length, longest))
         return start + length
 
     @property
@@ -254,7 +251,7 @@ def _limit(edge: Any) -> float:
 
 
 @dataclass(frozen=True)
-class _Branch:
+class _SideRoad:
     """A road that joins or leaves a path at a junction, as far as it is recorded.
 
     Attributes:
@@ -289,7 +286,7 @@ class Ramp:
     junction: int
     joins: bool
     names: list[str] = field(default_factory=list)
-    branches: list[_Branch] = field(default_factory=list)
+    branches: list[_SideRoad] = field(default_factory=list)
     exits: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
@@ -322,7 +319,7 @@ def _find_ramps(net: Net, path: list[Any], left_out: Collection[str], wanted: fl
     least half as long as wanted; else it goes on along the edge with the most lanes.
 
     Args:
-        net: the network.
+        net: the net.
         path: edges of the path.
         left_out: edges at the path that are no ramps.
         wanted: length of a branch [m]: the ramp's segment and the boundary segment behind it.
@@ -355,7 +352,7 @@ def _find_ramps(net: Net, path: list[Any], left_out: Collection[str], wanted: fl
         # A lay-by leaves the path and joins it again: each of its two ramps has a half.
         shared = (not joins, edge) in sides
         ramp.names.append(edge.getID())
-        ramp.branches.append(_Branch(chain, chain.length * (0.5 if shared else 1.0), joins))
+        ramp.branches.append(_SideRoad(chain, chain.length * (0.5 if shared else 1.0), joins))
         if not joins:
             ways = net.crossing(path[junction], edge)
             ramp.exits += [part.getID() for way in ways for part in way]
@@ -426,7 +423,7 @@ def _merged(ramps: list[Ramp], chain: Chain) -> tuple[list[Ramp], list[str]]:
 # Segments -------------------------------------------------------------------------------------
 
 
-def _limits(chain: Chain, ends: Ends) -> tuple[float, float]:
+def _limits(chain: Chain, ends: tuple[float, float | None]) -> tuple[float, float]:
     """Return the distances at which a road begins and ends along a path [m]."""
     last = chain.edges[-1].getLength()
     places = []

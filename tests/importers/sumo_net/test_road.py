@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from dptse_env.importers.network import Files, find_layout, import_road, read_configuration
+from dptse_env.importers.sumo_net import Files, import_road, read_configuration, segment_path
 from dptse_env.traffic import (
     MAINLINE,
     SHORT_HIGHWAY,
@@ -32,11 +32,11 @@ from dptse_env.traffic.sumo import running, seconds
 from dptse_env.traffic.sumo_input import packaged_network
 from dptse_env.utils.files import file_digest
 from tests.helpers import ROOT
-from tests.importers.network.conftest import FLOWS, PATH
+from tests.importers.sumo_net.conftest import FLOWS, PATH
 
 
 def imported(files, **options):
-    return import_road(files, find_layout(files, PATH, 100.0), "motorway", 240, **options)
+    return import_road(files, segment_path(files, PATH, 100.0), "motorway", 240, **options)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_routes_of_no_use_are_refused(files, tmp_path, content, message):
     path.write_text(content or "")
     own = dataclasses.replace(files, routes=(path,) if content else ())
     with pytest.raises(ValueError, match=re.escape(message)) as refused:
-        import_road(own, find_layout(files, PATH, 100.0), "road", 60)
+        import_road(own, segment_path(files, PATH, 100.0), "road", 60)
     assert "\n" not in str(refused.value)
 
 
@@ -125,7 +125,7 @@ def test_the_record_is_that_of_the_generated_network_if_the_files_are_the_same(t
         options=("--no-internal-links", "--collision.action=none", "--time-to-teleport=-1"),
     )
     path = ["upstream", *(f"main_{i}" for i in range(6)), "downstream"]
-    road = import_road(files, find_layout(files, path, 100.0), "short", 240, seed=3)
+    road = import_road(files, segment_path(files, path, 100.0), "short", 240, seed=3)
     expected = simulate(calm, 3)
     for name in ("step", "segment", "speed"):
         np.testing.assert_array_equal(getattr(road.record, name), getattr(expected, name))
@@ -163,7 +163,7 @@ def test_vehicles_out_of_order_depart_and_what_nobody_takes_is_told(files, tmp_p
     for name, text in (("mixed", routes), ("in-order", in_order)):
         (tmp_path / name).write_text(text)
         own = dataclasses.replace(files, routes=(tmp_path / name,))
-        roads.append(import_road(own, find_layout(own, PATH, 100.0), "road", 60))
+        roads.append(import_road(own, segment_path(own, PATH, 100.0), "road", 60))
     mixed, sorted_road = roads
     assert mixed.record.digest == sorted_road.record.digest
     assert "mixed: out of order of departure" in " ".join(mixed.remarks)
@@ -186,10 +186,10 @@ def test_vehicles_that_do_not_depart_are_told_when_they_are_recorded(road, tmp_p
 
 LOCAL = """
 import pathlib, sys
-from dptse_env.importers.network import Files, find_layout, import_road
+from dptse_env.importers.sumo_net import Files, segment_path, import_road
 from dptse_env.traffic import RecordLibrary, SHORT_HIGHWAY
 files = Files(pathlib.Path("road.net.xml"), (pathlib.Path("road.rou.xml"),))
-road = import_road(files, find_layout(files, sys.argv[1:], 100.0), "road", 30).corridor
+road = import_road(files, segment_path(files, sys.argv[1:], 100.0), "road", 30).corridor
 longer = SHORT_HIGHWAY.replaced({"segment_length": 0.15, "duration": 30, "incident": None})
 for corridor in (road, SHORT_HIGHWAY, longer):
     print(RecordLibrary("Aufzeichnungen für mich").get(corridor, 0).n_rows)
@@ -413,7 +413,7 @@ def test_nothing_that_files_name_is_written(files, place, tmp_path, monkeypatch)
     )
     before = {path: file_digest(path) for path in root.rglob("*")}
     read = read_configuration(root / "road.sumocfg")
-    road = import_road(read, find_layout(read, PATH, 100.0), "road", 30)
+    road = import_road(read, segment_path(read, PATH, 100.0), "road", 30)
     assert {path: file_digest(path) for path in root.rglob("*")} == before
     assert any(
         "more.add.xml: outputs that are not written: 1 of inductionLoop" in each

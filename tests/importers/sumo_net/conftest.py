@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dptse_env.importers.network import Files
+from dptse_env.importers.sumo_net import Files
 
 NODES = """
 <nodes>

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from dptse_env.importers.network import Files, read_configuration
+from dptse_env.importers.sumo_net import Files, read_configuration
 
 CONFIGURATION = """
 <configuration>

@@ -4,14 +4,14 @@ import re
 
 import pytest
 
-from dptse_env.importers.network import Files, find_layout
-from tests.importers.network.conftest import PATH
+from dptse_env.importers.sumo_net import Files, segment_path
+from tests.importers.sumo_net.conftest import PATH
 
 
 def refused(path, content):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=f"^net: {re.escape(str(path))}") as error:
-        find_layout(Files(path, ()), PATH, 100.0)
+        segment_path(Files(path, ()), PATH, 100.0)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 500
     return str(error.value)
@@ -22,13 +22,13 @@ def refused(path, content):
     [
         (b"\x00\x8f\x11 not to be read", "must be XML, got something else (binary, encrypted"),
         (b"\x1f\x8bno archive at all", "must be XML"),
-        (b"<routes/>", "must be a network (<net>), got <routes>"),
+        (b"<routes/>", "must be a SUMO net (<net>), got <routes>"),
         (b"<net version='9.1'/>", "version must be at most 1.20, got 9.1"),
-        (b"<net version='1.20'/>", "must have edges, got a network without any"),
-        (b"<net version='1.20'><edge id='%a'" % (b"a" * 10_000), "must be a network of SUMO, got"),
+        (b"<net version='1.20'/>", "must have edges, got a net without any"),
+        (b"<net version='1.20'><edge id='%a'" % (b"a" * 10_000), "must be a SUMO net, got"),
     ],
 )
-def test_files_that_are_no_networks_are_refused(tmp_path, content, message):
+def test_files_that_are_no_nets_are_refused(tmp_path, content, message):
     assert message in refused(tmp_path / "road.net.xml", content)
 
 
@@ -43,6 +43,6 @@ def test_files_that_are_no_networks_are_refused(tmp_path, content, message):
         (r'<connection from=":[^/]*/>', "", "must lead over its junction, got an end"),
     ],
 )
-def test_damaged_networks_are_refused(files, tmp_path, pattern, change, message):
+def test_damaged_nets_are_refused(files, tmp_path, pattern, change, message):
     damaged = re.sub(pattern, change, files.net.read_text())
     assert message in refused(tmp_path / "road.net.xml", damaged.encode())

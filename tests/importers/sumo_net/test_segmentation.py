@@ -4,8 +4,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from dptse_env.importers.network import Files, find_layout
-from tests.importers.network.conftest import CONNECTIONS, EDGES, NODES, PATH, netconvert
+from dptse_env.importers.sumo_net import Files, segment_path
+from tests.importers.sumo_net.conftest import CONNECTIONS, EDGES, NODES, PATH, netconvert
 
 
 def lengths_of_edges(network):
@@ -17,10 +17,11 @@ def lengths_of_edges(network):
 
 
 def test_segments_cover_the_path_without_gaps(files):
-    layout = find_layout(files, PATH, 100.0)
+    segments = segment_path(files, PATH, 100.0)
     edges = lengths_of_edges(files.net)
-    S = len(layout.lengths) + 2
-    on_path = [*layout.columns[S : S + 1], *layout.columns[: S - 2], layout.columns[S + 1]]
+    S = len(segments.lengths) + 2
+    columns = segments.columns
+    on_path = [*columns[S : S + 1], *columns[: S - 2], columns[S + 1]]
     stretches = [stretch for column in on_path for stretch in column]
     for name in PATH:
         parts = [(start, end) for edge, start, end in stretches if edge == name]
@@ -29,32 +30,33 @@ def test_segments_cover_the_path_without_gaps(files):
         assert all(end == start for (_, end), (start, _) in pairwise(parts))
     internal = {edge for edge, _, _ in stretches if edge.startswith(":")}
     assert len(internal) == 5  # four junctions along the path, and one way out of it
-    total = sum(layout.lengths) + 2 * layout.lengths[0]
+    total = sum(segments.lengths) + 2 * segments.lengths[0]
     crossings = sum(edges[edge] for edge in internal)
     assert total == pytest.approx(sum(edges[name] for name in PATH) + crossings, rel=0.02)
 
 
 def test_ramps_lie_at_faces_and_acceleration_lanes_count_as_lanes_of_the_mainline(files):
-    layout, longer = (find_layout(files, PATH, length) for length in (100.0, 150.0))
-    (on,), (off,) = layout.on_ramps, layout.off_ramps
+    segments, longer = (segment_path(files, PATH, length) for length in (100.0, 150.0))
+    (on,), (off,) = segments.on_ramps, segments.off_ramps
     assert on == 3  # 400 m before the junction are four parts, the first of them the boundary
-    assert layout.names == ("ramp-b", "exit-a")
-    between = layout.lengths[on:off]
+    assert segments.names == ("ramp-b", "exit-a")
+    between = segments.lengths[on:off]
     assert between == pytest.approx([between[0]] * len(between))
     assert 90.0 < between[0] < 110.0
-    assert layout.ramp_lengths == pytest.approx((100.0, 100.0))
-    assert layout.lanes[:on] == (2,) * on
-    assert layout.lanes[on : on + 2] == (3, 3)  # 250 m: two segments, and less than half of one
-    assert set(layout.lanes[on + 3 :]) == {2}
+    assert segments.ramp_lengths == pytest.approx((100.0, 100.0))
+    assert segments.lanes[:on] == (2,) * on
+    # 250 m: two segments, and less than half of one
+    assert segments.lanes[on : on + 2] == (3, 3)
+    assert set(segments.lanes[on + 3 :]) == {2}
     assert longer.lanes[longer.on_ramps[0] + 1] == 3  # two thirds of it
-    assert layout.limits[0] == pytest.approx(108.0)
-    assert layout.limits[-1] == pytest.approx(90.0)
+    assert segments.limits[0] == pytest.approx(108.0)
+    assert segments.limits[-1] == pytest.approx(90.0)
     # Ramps of several edges go on behind a boundary inside an edge.
     ramp, before = longer.columns[len(longer.lengths)], longer.columns[-2]
     assert {edge for edge, _, _ in ramp if not edge.startswith(":")} == {"ramp-b"}
     assert {edge for edge, _, _ in before if not edge.startswith(":")} == {"ramp-b", "ramp-a"}
-    part = find_layout(files, PATH, 100.0, ends=(150.0, 300.0))
-    assert len(part.lengths) < len(layout.lengths)
+    part = segment_path(files, PATH, 100.0, ends=(150.0, 300.0))
+    assert len(part.lengths) < len(segments.lengths)
     (upstream,) = part.columns[len(part.lengths) + 2]
     assert upstream[:2] == ("in", 150.0)
     assert part.columns[len(part.lengths) + 3][-1] == ("out", pytest.approx(200.0, abs=5.0), 300.0)
@@ -68,10 +70,10 @@ def test_roads_that_meet_at_one_junction_are_one_ramp(tmp_path):
         "</connections>",
         '<connection from="second" to="merge" fromLane="0" toLane="2"/></connections>',
     )
-    layout = find_layout(Files(netconvert(tmp_path, NODES, edges, connections), ()), PATH, 100.0)
-    assert layout.names[0] == "ramp-b + second"
-    assert layout.ramp_lanes == (2, 1)
-    columns = layout.columns[len(layout.lengths)]
+    segments = segment_path(Files(netconvert(tmp_path, NODES, edges, connections), ()), PATH, 100.0)
+    assert segments.names[0] == "ramp-b + second"
+    assert segments.ramp_lanes == (2, 1)
+    columns = segments.columns[len(segments.lengths)]
     assert {"ramp-b", "second"} <= {edge for edge, _, _ in columns}
 
 
@@ -87,14 +89,14 @@ def test_a_lay_by_is_an_off_ramp_and_an_on_ramp_on_either_half(tmp_path):
         '<connection from="lay-by" to="bend" fromLane="0" toLane="0"/></connections>',
     )
     network = netconvert(tmp_path, NODES, edges, connections)
-    layout = find_layout(Files(network, ()), PATH, 100.0)
-    assert layout.names == ("ramp-b", "lay-by", "lay-by", "exit-a")
-    N = len(layout.lengths)
-    joining, leaving = layout.columns[N + 1], layout.columns[N + 2]
+    segments = segment_path(Files(network, ()), PATH, 100.0)
+    assert segments.names == ("ramp-b", "lay-by", "lay-by", "exit-a")
+    N = len(segments.lengths)
+    joining, leaving = segments.columns[N + 1], segments.columns[N + 2]
     assert leaving[0][:2] == ("lay-by", 0.0)
     assert joining[0][1] > leaving[0][2] + 100.0  # the two boundary segments lie between them
     # Not one vehicle can be on two columns: the road would be refused.
-    taken = sorted((s, e) for column in layout.columns for n, s, e in column if n == "lay-by")
+    taken = sorted((s, e) for column in segments.columns for n, s, e in column if n == "lay-by")
     assert all(end <= start for (_, end), (start, _) in pairwise(taken))
 
 
@@ -112,7 +114,7 @@ def test_a_lay_by_is_an_off_ramp_and_an_on_ramp_on_either_half(tmp_path):
 )
 def test_paths_of_no_use_are_refused_in_one_line(files, path, options, message):
     with pytest.raises(ValueError, match=re.escape(message)) as refused:
-        find_layout(files, path, 100.0, **options)
+        segment_path(files, path, 100.0, **options)
     assert "\n" not in str(refused.value)
 
 
@@ -129,7 +131,7 @@ def test_ramps_too_near_to_one_another_are_refused_by_name(tmp_path):
     with pytest.raises(
         ValueError, match=r'on-ramp ramp-b and off-ramp off are \d+ m apart; .* --leave-out="off"$'
     ):
-        find_layout(found, PATH, 100.0)
-    kept = find_layout(found, PATH, 100.0, left_out=("off",))
+        segment_path(found, PATH, 100.0)
+    kept = segment_path(found, PATH, 100.0, left_out=("off",))
     assert kept.names == ("ramp-b", "exit-a")
     assert any(remark.startswith("left out: off") for remark in kept.remarks)
