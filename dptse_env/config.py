@@ -1,4 +1,4 @@
-"""The configuration of an environment: a dataclass, presets, and keywords that change these.
+"""The configuration of an environment: a dataclass, the table of its keywords, and presets.
 
 Everything is reachable from plain JSON, so the keywords of ``gym.make`` survive a spec. A
 configuration holds and checks; `dptse_env.parts` makes what it describes.
@@ -7,25 +7,19 @@ configuration holds and checks; `dptse_env.parts` makes what it describes.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Annotated, Any
+from functools import cached_property, partial
+from typing import Annotated, Any, NamedTuple
 
-from dptse_env.estimators import (
-    ESTIMATORS,
-    check_estimator,
-    check_settings,
-    checked_settings,
-    settings_type,
-)
+from dptse_env.estimators import ESTIMATORS, check_estimator, checked_settings, settings_type
 from dptse_env.estimators.settings import (
     read_settings,
     tuned_estimator,
     tuned_settings,
     tuned_with,
 )
-from dptse_env.model import ARZModel, ARZParameters, available_parameters, load_parameters
+from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.release import (
     RELEASE_MODELS,
@@ -36,6 +30,7 @@ from dptse_env.release import (
     PrivacySettings,
     QueryOptions,
 )
+from dptse_env.release.queries import check_levels, check_spans
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.spaces.observations import BLOCKS, DEFAULT
 from dptse_env.spaces.rewards import REWARDS
@@ -49,18 +44,18 @@ from dptse_env.traffic import (
     read_road,
 )
 from dptse_env.traffic.imported import has_vehicles, recorded_seeds, require_seeds
-from dptse_env.traffic.roads import RoadFile
 from dptse_env.utils.fields import (
     Interval,
-    checked_fields,
+    convert,
     cut,
     field_hints,
     from_mapping,
     require,
     require_name,
     shown,
+    within,
 )
-from dptse_env.utils.registry import OR_IMPORTED
+from dptse_env.utils.registry import Registry
 
 TRAINING_SEEDS = range(1_000)
 """Traffic seeds meant for training and calibration."""
@@ -122,6 +117,8 @@ class EnvConfig:
         truth_in_info: Whether ``info`` shows the true traffic.
         inherited: Keywords whose values were measured or tuned on another road than this one, or
             with other ARZ parameters, and that nobody gave; filled in by `resolve`.
+        origins: Text in front of messages on keywords that a road file gave, by keyword; filled in
+            by `resolve`.
 
     Raises:
         ValueError: A value is out of range.
@@ -148,67 +145,13 @@ class EnvConfig:
     traffic_seeds: tuple[TrafficSeed, ...] = tuple(TRAINING_SEEDS[:64])
     truth_in_info: bool = False
     inherited: tuple[str, ...] = field(default=(), compare=False)
+    origins: Mapping[str, str] = field(default_factory=dict, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check everything that needs no traffic."""
-        checked_fields(self, "")
-        ACTION_ENCODINGS.find(self.action)
-        REWARDS.find(self.reward)
-        for block in self.observation:
-            if not (isinstance(block, str) and block == DEFAULT):
-                BLOCKS.find(block)
-        check_estimator(self.estimator, self.backend)
-        n, duration, seeds = self.corridor.n_mainline, self.corridor.duration, self.traffic_seeds
-        require(self.bandwidth <= n, "bandwidth", f"in 1..{n}", self.bandwidth)
-        require(self.horizon_steps <= duration, "horizon", f"in 1..{duration}", self.horizon)
-        if self.random_start:
-            shorter = f"below the record's {duration} s where random_start is true"
-            require(self.horizon_steps < duration, "horizon", shorter, self.horizon)
-        most = f"1 to {MOST_SEEDS} seeds"
-        require(1 <= len(seeds) <= MOST_SEEDS, "traffic_seeds", most, f"{len(seeds)} of them")
-        require(len(set(seeds)) == len(seeds), "traffic_seeds", "distinct", seeds)
-        self._check_queries()
-        self._check_sensors()
-        if isinstance(self.parameters, str):
-            require_name("parameters", self.parameters, available_parameters())
-        self.settings()
-
-    def _check_queries(self) -> None:
-        """Check the options, and that the release model can answer them."""
-        _ = self.queries  # refuses bad values
-        model, spans = RELEASE_MODELS.find(self.privacy.preset), self.query_spans
-        plain = (
-            f"(1,) with the release model {RELEASE_MODELS.name_of(model)!r}, which releases no sums"
-        )
-        for key in ("query_spans", "price_levels"):
-            value = getattr(self, key)
-            require(value == (1,) or model.releases_sums, key, plain, value)
-        if max(spans) > 1:
-            lengths = set(self.corridor.segment_lengths[: self.corridor.n_mainline])
-            alike = "(1,) where mainline segments differ in length"
-            require(len(lengths) == 1, "query_spans", alike, spans)
-            centre = model.flow_centre(self.corridor, self.privacy)
-            require(centre is not None, "query_spans", "(1,) where mean speeds are released", spans)
-
-    def _check_sensors(self) -> None:
-        """Check that the road has what penetration, detectors and the release model need."""
-        n, factor, recordings = (
-            len(self.corridor.fixed_sensors), self.detectors.factor, self.corridor.recordings
-        )  # fmt: skip
-        each = f"one number, or one for each of the {n} fixed sensors"
-        require(not isinstance(factor, tuple) or len(factor) == n, "detectors.factor", each, factor)
-        has_some = n > 0 or self.detectors == Detectors()
-        require(has_some, "detectors", "left out on a road without fixed sensors", self.detectors)
-        if recordings is None:
-            return
-        require_seeds(recordings, self.traffic_seeds)
-        if not has_vehicles(recordings):
-            preset, share = self.privacy.preset, self.penetration.share
-            blind = "one that needs no vehicles, as 'paper', on a road of measured fields"
-            is_blind = not RELEASE_MODELS.find(preset).needs_vehicles
-            require(is_blind, "privacy.preset", blind, RELEASE_MODELS.name_of(preset))
-            whole = "1, and detectors left out, on a road of measured fields"
-            require(not self.has_separate_sensors, "penetration.share", whole, share)
+        """Read every field by `KEYWORDS`, so that lists become tuples and all is checked."""
+        values = {name: getattr(self, name) for name in KEYWORDS}
+        for name, value in read_keywords(values, values, {}).items():
+            object.__setattr__(self, name, value)
 
     @property
     def has_separate_sensors(self) -> bool:
@@ -247,11 +190,9 @@ class EnvConfig:
     def settings_name(self) -> str | None:
         """Name of the shipped set of estimator settings in force; None if there is none."""
         given = self.estimator_settings
-        if given is not None:
-            return given if isinstance(given, str) else None
-        # A road of one's own takes no variant that happens to have its name.
-        road = self.corridor.name if self.corridor.name in CORRIDORS else ""
-        return tuned_settings(self.estimator, self.arz_parameters, self.privacy.preset, road)
+        if given is None:
+            return _tuned(self.estimator, self.parameters, self.privacy, self.corridor)
+        return given if isinstance(given, str) else None
 
     def settings(self) -> Any:
         """Return the estimator's settings in force, of its settings' type.
@@ -260,6 +201,318 @@ class EnvConfig:
             ValueError: They are no settings of this estimator.
         """
         return checked_settings(self.estimator, self.settings_name or self.estimator_settings)
+
+
+# Readers ------------------------------------------------------------------------------------------
+#
+# Each takes the path of a value, the value, the preset's value and the keywords that it needs, and
+# returns the field. A value that was read already it checks and returns as it is.
+
+
+def _typed(path: str, value: Any, base: Any) -> Any:
+    """Return a value as the annotation of its field has it; mappings change the preset's value."""
+    return convert(field_hints(EnvConfig)[path], value, path, base)
+
+
+def _part(registry: Registry, _path: str, value: Any, _base: Any) -> Any:
+    """Return the name of a part, ``"package.module:Name"``, or a part, if there is such a one."""
+    registry.find(value)
+    return value
+
+
+def _corridor(path: str, value: Any, base: Corridor) -> Corridor:
+    """Return a corridor: by name, an object, or fields that replace those of the preset's.
+
+    Demand and incident may be ``"preset"``, for the road's own, or ``"random"``, drawn anew for
+    every traffic seed; an incident also ``"none"``.
+    """
+    if not isinstance(value, Mapping):
+        return find_corridor(value)
+    names = {"demand": ("preset", "random"), "incident": ("preset", "random", "none")}
+    named = {key: value[key] for key in names if isinstance(value.get(key), str)}
+    corridor = base.replaced({key: each for key, each in value.items() if key not in named})
+    for key, name in named.items():
+        require_name(f"{path}.{key}", name, names[key])
+        source = randomised(corridor) if name == "random" else corridor
+        corridor = corridor.replaced({key: None if name == "none" else getattr(source, key)})
+    return corridor
+
+
+def _privacy(path: str, value: Any, base: PrivacySettings, corridor: Corridor) -> Any:
+    """Return settings of a release model: its name or class, an object, or some of its fields.
+
+    Another release model keeps epsilon and delta, and has its own defaults otherwise.
+    """
+    if not isinstance(value, PrivacySettings):
+        given = {"preset": value} if isinstance(value, str | type) else value
+        allowed = "the name of a release model, a class or a mapping"
+        require(isinstance(given, Mapping), path, allowed, value)
+        preset = given.get("preset", base.preset)
+        require(isinstance(preset, str | type), f"{path}.preset", "a name or a class", preset)
+        if preset != base.preset:
+            expected = RELEASE_MODELS.find(preset).settings_type
+            base = expected(preset=preset, epsilon=base.epsilon, delta=base.delta)
+        value = from_mapping(type(base), {**given, "preset": preset}, path, base)
+    model = RELEASE_MODELS.find(value.preset)
+    blind = "one that needs no vehicles, as 'paper', on a road of measured fields"
+    is_served = has_vehicles(corridor.recordings) or not model.needs_vehicles
+    require(is_served, f"{path}.preset", blind, RELEASE_MODELS.name_of(value.preset))
+    return value
+
+
+def _penetration(path: str, value: Any, base: Penetration, corridor: Corridor) -> Penetration:
+    """Return the connected vehicles; a number, or a pair of numbers, is their share."""
+    fields = value if isinstance(value, Mapping | Penetration) else {"share": value}
+    found: Penetration = _typed(path, fields, base)
+    whole = found.is_complete or has_vehicles(corridor.recordings)
+    require(whole, f"{path}.share", "1 on a road of measured fields", found.share)
+    return found
+
+
+def _detectors(path: str, value: Any, base: Detectors, corridor: Corridor) -> Detectors:
+    """Return the errors of the fixed sensors, which there must be."""
+    found: Detectors = _typed(path, value, base)
+    n, factor = len(corridor.fixed_sensors), found.factor
+    each = f"one number, or one for each of the {n} fixed sensors"
+    require(not isinstance(factor, tuple) or len(factor) == n, f"{path}.factor", each, factor)
+    exact = "left out on a road without fixed sensors, and on one of measured fields"
+    has_any = n > 0 and has_vehicles(corridor.recordings)
+    require(has_any or found == Detectors(), path, exact, found)
+    return found
+
+
+def _backend(path: str, value: Any, base: Any, estimator: Any) -> str:
+    """Return the backend, which the estimator must have."""
+    check_estimator(estimator, value)
+    return str(_typed(path, value, base))
+
+
+def _parameters(path: str, value: Any, base: Any) -> str | ARZParameters:
+    """Return ARZ parameters: the name of a set, a mapping of them all, or a JSON file."""
+    if isinstance(value, str) and value.endswith(".json"):
+        return read_parameters(value)
+    found: str | ARZParameters = _typed(path, value, base)
+    if isinstance(found, str):
+        require_name(path, found, available_parameters())
+    return found
+
+
+def _tuned(
+    estimator: Any, parameters: str | ARZParameters, privacy: PrivacySettings, corridor: Corridor
+) -> str | None:
+    """Return the name of the shipped settings that hold where none are given, if any ship."""
+    # A road of one's own takes no variant that happens to have its name.
+    road = corridor.name if corridor.name in CORRIDORS else ""
+    arz = load_parameters(parameters) if isinstance(parameters, str) else parameters
+    return tuned_settings(estimator, arz, privacy.preset, road)
+
+
+def _settings(
+    path: str, value: Any, _base: Any, estimator: Any, parameters: Any, privacy: Any, corridor: Any
+) -> Any:
+    """Return settings of the estimator: a name, an object, a JSON file, or some of its fields.
+
+    Fields left out keep what None stands for: those of the tuned set, or else the defaults.
+    """
+    tuned = _tuned(estimator, parameters, privacy, corridor)
+    if isinstance(value, Mapping):
+        base = checked_settings(estimator, tuned)
+        value = from_mapping(settings_type(estimator), value, path, base)
+    elif isinstance(value, str) and value.endswith(".json"):
+        value = read_settings(value)
+    checked_settings(estimator, tuned if value is None else value)
+    return value
+
+
+def _spans(
+    path: str, value: Any, base: Any, corridor: Corridor, privacy: PrivacySettings
+) -> tuple[int, ...]:
+    """Return numbers of segments, which the road must have and the release model must sum."""
+    spans: tuple[int, ...] = _typed(path, value, base)
+    n = corridor.n_mainline
+    check_spans(n, spans)
+    _check_sums(path, spans, privacy)
+    if max(spans) > 1:
+        alike = "(1,) where mainline segments differ in length"
+        require(len(set(corridor.segment_lengths[:n])) == 1, path, alike, spans)
+        centre = RELEASE_MODELS.find(privacy.preset).flow_centre(corridor, privacy)
+        require(centre is not None, path, "(1,) where mean speeds are released", spans)
+    return spans
+
+
+def _check_sums(path: str, value: Any, privacy: PrivacySettings) -> None:
+    model = RELEASE_MODELS.find(privacy.preset)
+    name = RELEASE_MODELS.name_of(model)
+    plain = f"(1,) with the release model {name!r}, which releases no sums"
+    require(value == (1,) or model.releases_sums, path, plain, value)
+
+
+def _bandwidth(
+    path: str, value: Any, base: Any, corridor: Corridor, spans: tuple[int, ...], unit: str
+) -> int:
+    """Return the bandwidth, which must pay for a query and not for more than the road has."""
+    found: int = _typed(path, value, base)
+    n, least = corridor.n_mainline, spans[0] if unit == "segments" else 1
+    reason = f", to pay for a query of {least} segments" if least > 1 else ""
+    require(least <= found <= n, path, f"in {least}..{n}{reason}", found)
+    return found
+
+
+def _limited_bandwidth(base: int, corridor: Corridor, *_: Any) -> int:
+    """Return the preset's bandwidth, or, with a warning, all segments of a shorter road."""
+    n = corridor.n_mainline
+    if n < base:
+        warnings.warn(
+            f"bandwidth is {n}, the number of mainline segments, since nobody gave it and "
+            f"{corridor.name} is too short for the default of {base}",
+            UserWarning,
+            stacklevel=1,
+        )
+    return min(base, n)
+
+
+def _levels(
+    path: str, value: Any, base: Any, corridor: Corridor, privacy: Any, spans: tuple[int, ...]
+) -> tuple[float, ...]:
+    """Return price levels, which the release model must have."""
+    levels: tuple[float, ...] = _typed(path, value, base)
+    check_levels(corridor.n_mainline, spans, levels)
+    _check_sums(path, levels, privacy)
+    return levels
+
+
+def _observation(path: str, value: Any, base: Any) -> tuple[Any, ...]:
+    """Return the blocks, of which there may be one by itself."""
+    blocks: tuple[Any, ...] = _typed(path, (value,) if isinstance(value, str) else value, base)
+    for block in blocks:
+        if not (isinstance(block, str) and block == DEFAULT):
+            BLOCKS.find(block)
+    return blocks
+
+
+def _horizon(
+    path: str, value: Any, base: Any, corridor: Corridor, random_start: bool
+) -> int | None:
+    """Return the length of an episode, which the record must have, and more for a random start."""
+    found: int | None = _typed(path, value, base)
+    most = corridor.duration - random_start
+    allowed = f"in 1..{most}, shorter than the record for a random start"
+    fits = (corridor.duration if found is None else found) <= most
+    require(fits, path, allowed if random_start else f"in 1..{most}", found)
+    return found
+
+
+def _seeds(path: str, value: Any, base: Any, corridor: Corridor) -> tuple[int, ...]:
+    """Return distinct traffic seeds, a sequence or ``"first:stop"``, as far as recorded."""
+    seeds: tuple[int, ...] = _typed(
+        path, parse_seeds(value, path) if isinstance(value, str) else value, base
+    )
+    n = len(seeds)
+    require(1 <= n <= MOST_SEEDS, path, f"1 to {MOST_SEEDS} seeds", f"{n} of them")
+    require(len(set(seeds)) == n, path, "distinct", seeds)
+    if corridor.recordings is not None:
+        require_seeds(corridor.recordings, seeds, path)
+    return seeds
+
+
+def _recorded_seeds(base: tuple[int, ...], corridor: Corridor) -> tuple[int, ...]:
+    """Return the preset's traffic seeds, or all of training that were recorded on the road."""
+    if corridor.recordings is None:
+        return base
+    return tuple(seed for seed in recorded_seeds(corridor.recordings) if seed in TRAINING_SEEDS)
+
+
+def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:
+    """Return the seeds that ``"first:stop"`` or ``"one"`` stands for, ``stop`` left out.
+
+    Raises:
+        ValueError: The text is neither, or the range is empty or too long.
+    """
+    first, colon, stop = text.partition(":")
+    is_range = first.isdecimal() and (stop.isdecimal() or not colon) and len(text) <= 40
+    require(is_range, path, "'first:stop' or one seed", text)
+    seeds = range(int(first), int(stop) if colon else int(first) + 1)
+    require(seeds.stop > seeds.start, path, "a range of seeds that is not empty", text)
+    require(seeds.stop - seeds.start <= MOST_SEEDS, path, f"at most {MOST_SEEDS} seeds", text)
+    return tuple(seeds)
+
+
+# The table ----------------------------------------------------------------------------------------
+
+
+class Keyword(NamedTuple):
+    """A keyword of an environment.
+
+    Attributes:
+        read: Function of its path, its value, the preset's value and the fields that it ``needs``;
+            it returns the value of the field.
+        needs: Fields that stand before it in the table.
+        default: Function of the preset's value and the fields that it ``needs``, for the value
+            where none is given; None for the preset's.
+    """
+
+    read: Callable[..., Any] = _typed
+    needs: tuple[str, ...] = ()
+    default: Callable[..., Any] | None = None
+
+
+KEYWORDS = {
+    "corridor": Keyword(_corridor),
+    "privacy": Keyword(_privacy, ("corridor",)),
+    "penetration": Keyword(_penetration, ("corridor",)),
+    "detectors": Keyword(_detectors, ("corridor",)),
+    "fusion": Keyword(),
+    "estimator": Keyword(partial(_part, ESTIMATORS)),
+    "backend": Keyword(_backend, ("estimator",)),
+    "parameters": Keyword(_parameters),
+    "estimator_settings": Keyword(_settings, ("estimator", "parameters", "privacy", "corridor")),
+    "query_spans": Keyword(_spans, ("corridor", "privacy")),
+    "price_levels": Keyword(_levels, ("corridor", "privacy", "query_spans")),
+    "bandwidth_unit": Keyword(),
+    "bandwidth": Keyword(
+        _bandwidth, ("corridor", "query_spans", "bandwidth_unit"), default=_limited_bandwidth
+    ),
+    "action": Keyword(partial(_part, ACTION_ENCODINGS)),
+    "observation": Keyword(_observation),
+    "reward": Keyword(partial(_part, REWARDS)),
+    "random_start": Keyword(),
+    "horizon": Keyword(_horizon, ("corridor", "random_start")),
+    "traffic_seeds": Keyword(_seeds, ("corridor",), default=_recorded_seeds),
+    "truth_in_info": Keyword(),
+}
+"""The keywords of an environment, each after those that it needs: the fields of `EnvConfig`."""
+
+SHORTCUTS = {
+    "demand": "corridor", "incident": "corridor", "epsilon": "privacy", "delta": "privacy",
+}  # fmt: skip
+"""Keywords that stand for a field of another one."""
+
+
+def read_keywords(
+    values: Mapping[str, Any], base: Mapping[str, Any], origins: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return the fields of `EnvConfig` that keywords stand for.
+
+    Args:
+        values: Values by keyword.
+        base: Values of all fields, which ``values`` change.
+        origins: Text in front of messages, by keyword.
+
+    Raises:
+        ValueError: A value is out of range; the message starts with its origin and path.
+    """
+    found: dict[str, Any] = {}
+    for name, keyword in KEYWORDS.items():
+        value, needs = base[name], [found[need] for need in keyword.needs]
+        if name not in values and keyword.default is not None:
+            value = keyword.default(value, *needs)
+        given = {name: values.get(name, value)}
+        given |= {key: {key: values[key]} for key in values if SHORTCUTS.get(key) == name}
+        for key, each in given.items():
+            with within(origins.get(key, "")):
+                value = keyword.read(name, each, value, *needs)
+        found[name] = value
+    return found
 
 
 PRESETS = {
@@ -289,27 +542,20 @@ class UnknownKeywordError(TypeError, ValueError):
 
 
 def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
-    """Return a preset with some of its fields replaced.
+    """Return a preset with some of its keywords replaced.
+
+    A corridor that ends in ``.toml`` is a road file, whose table ``environment`` gives keywords
+    that are not among ``overrides``, but for settings in a file that were tuned for another
+    estimator.
 
     Args:
         preset: A name in `PRESETS`.
-        overrides: Fields of `EnvConfig`. A mapping replaces the named fields of a nested
-            dataclass and keeps the others. Names stand for known values: a corridor, a release
-            model. A corridor that ends in ``.toml`` is a road file, whose table ``environment``
-            gives keywords that are not among ``overrides``, but for settings in a file that were
-            tuned for another estimator; ``parameters`` and ``estimator_settings`` may be JSON
-            files. Shortcuts: ``epsilon`` and ``delta``
-            of ``privacy``, ``incident`` of ``corridor`` (``"preset"``, ``"none"``, ``"random"`` or
-            a mapping) and ``demand`` of ``corridor`` (the same without ``"none"``); random means
-            drawn anew for every traffic seed. ``traffic_seeds`` may be a string ``"first:stop"``;
-            on a road with recordings they are by default all recorded training seeds.
-            In a mapping ``estimator_settings``, fields left out keep what None would have given:
-            the tuned set of the resolved estimator, parameters and privacy preset, or else the
-            defaults.
+        overrides: Values of `KEYWORDS` and `SHORTCUTS`.
 
     Raises:
-        UnknownKeywordError: A key is no field and no shortcut.
-        ValueError: A value is out of range; the message starts with its path.
+        UnknownKeywordError: There is no such keyword.
+        ValueError: A value is out of range; the message starts with its path, and before that with
+            the road file that has it.
 
     Warns:
         UserWarning: The corridor is another road, or the ARZ parameters are of one's own, and
@@ -317,183 +563,65 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
             short for the default bandwidth.
     """
     require_name("preset", preset, PRESETS)
-    corridor = overrides.get("corridor")
-    road = read_road(corridor) if is_road_file(corridor) else None
-    try:
-        config, inherited = _resolve(PRESETS[preset], overrides, road)
-    except ValueError as problem:
-        raise _of_file(problem, overrides, road) from problem
-    if inherited and not config.inherited:
-        config = replace(config, inherited=inherited)
-        warnings.warn(
-            f"{', '.join(inherited)}: values measured or tuned on {PRESETS[preset].corridor.name}, "
-            "or assumed, are used on another road or with other parameters; `dptse fit` "
-            "fits parameters to a road file, `dptse tune` tunes settings",
-            UserWarning,
-            stacklevel=1,  # one place, so that Python tells it once, however environments are made
-        )
-    return config
-
-
-def _of_file(
-    problem: ValueError, overrides: Mapping[str, Any], road: RoadFile | None
-) -> ValueError:
-    """Return an error with the road file in front where the value that it names comes from it."""
-    if road is None:
-        return problem
-    own = [key for key in road.environment if key not in overrides]
-    places = [(path, "environment.") for key in own for path in (key, _SHORTCUTS.get(key, key))]
-    for path, table in (*places, ("corridor", "")):
-        if str(problem).startswith(cut(path)):
-            said = str(problem).replace(OR_IMPORTED, "")
-            return type(problem)(f"{overrides['corridor']}: {table}{said}")
-    return problem
-
-
-def check_road(config: EnvConfig, model: ARZModel, overrides: Mapping[str, Any]) -> None:
-    """Refuse an estimator's settings on a road, and a road for an estimator.
-
-    Args:
-        config: What `resolve` made of the overrides.
-        model: Its traffic model.
-        overrides: The keywords.
-
-    Raises:
-        ValueError: As `dptse_env.estimators.check_settings`, with the road file in front where the
-            value that it names comes from it.
-    """
-    try:
-        check_settings(config.estimator, model, config.settings())
-    except ValueError as problem:
-        path = overrides.get("corridor")
-        road = read_road(path) if is_road_file(path) else None
-        raise _of_file(problem, overrides, road) from problem
-
-
-def _resolve(
-    base: EnvConfig, overrides: Mapping[str, Any], road: RoadFile | None
-) -> tuple[EnvConfig, tuple[str, ...]]:
-    """Return a configuration, and the keywords that it inherits from another road."""
-    corridor = overrides.get("corridor")
-    values = {**road.environment, **overrides, "corridor": road.corridor} if road else {**overrides}
-    _check_keywords(values)
-    estimator = values.get("estimator", base.estimator)
-    if road and "estimator_settings" not in overrides and _is_tuned_for_another(values, estimator):
-        del values["estimator_settings"]
-    _read_files(values)
-    given = {**values, "corridor": corridor} if road else dict(values)
-    values["corridor"] = corridor = _corridor(base.corridor, values)
-    values["privacy"] = _privacy(base.privacy, values)
-    if not isinstance(values.get("penetration", {}), Mapping | Penetration):
-        values["penetration"] = {"share": values["penetration"]}
-    _read_seeds(values, corridor)
-    if "bandwidth" not in values and corridor.n_mainline < base.bandwidth:
-        values["bandwidth"] = corridor.n_mainline
-        warnings.warn(
-            f"bandwidth is {corridor.n_mainline}, the number of mainline segments, since nobody "
-            f"gave it and {corridor.name} is too short for the default of {base.bandwidth}",
-            UserWarning,
-            stacklevel=1,
-        )
-    if isinstance(values.get("observation"), str):
-        values["observation"] = (values["observation"],)
-    settings = values.get("estimator_settings")
-    changes = values.pop("estimator_settings") if isinstance(settings, Mapping) else None
-    config = from_mapping(EnvConfig, values, "", base)
-    if changes is not None:
-        expected = settings_type(config.estimator)
-        settings = from_mapping(expected, changes, "estimator_settings", config.settings())
-        config = replace(config, estimator_settings=settings)
-    return config, _inherited(corridor, config, given, road.assumed if road else ())
-
-
-def _read_seeds(values: dict[str, Any], corridor: Corridor) -> None:
-    """Replace a range of traffic seeds by these, and put recorded ones where none are given."""
-    if "traffic_seeds" not in values and corridor.recordings is not None:
-        recorded = recorded_seeds(corridor.recordings)
-        values["traffic_seeds"] = tuple(seed for seed in recorded if seed in TRAINING_SEEDS)
-    if isinstance(values.get("traffic_seeds"), str):
-        values["traffic_seeds"] = parse_seeds(values["traffic_seeds"], "traffic_seeds")
-
-
-def _read_files(values: dict[str, Any]) -> None:
-    """Replace names of JSON files of parameters and estimator settings by their content."""
-    for key, read in (("parameters", read_parameters), ("estimator_settings", read_settings)):
-        value = values.get(key)
-        if isinstance(value, str) and value.endswith(".json"):
-            values[key] = read(value)
-
-
-def _is_tuned_for_another(values: Mapping[str, Any], estimator: Any) -> bool:
-    """Return whether settings are a file of those that were tuned for another estimator."""
-    path = str(values.get("estimator_settings"))
-    return path.endswith(".json") and tuned_estimator(path) != ESTIMATORS.name_of(estimator)
-
-
-def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:
-    """Return the seeds that ``"first:stop"`` or ``"one"`` stands for, ``stop`` left out.
-
-    Raises:
-        ValueError: The text is neither, or the range is empty or too long.
-    """
-    first, colon, stop = text.partition(":")
-    is_range = first.isdecimal() and (stop.isdecimal() or not colon) and len(text) <= 40
-    require(is_range, path, "'first:stop' or one seed", text)
-    seeds = range(int(first), int(stop) if colon else int(first) + 1)
-    require(seeds.stop > seeds.start, path, "a range of seeds that is not empty", text)
-    require(seeds.stop - seeds.start <= MOST_SEEDS, path, f"at most {MOST_SEEDS} seeds", text)
-    return tuple(seeds)
-
-
-_SHORTCUTS = {
-    "epsilon": "privacy.epsilon", "delta": "privacy.delta", "incident": "corridor.incident",
-    "demand": "corridor.demand",
-}  # fmt: skip
-"""Keywords that stand for a field of another one."""
-
-
-def _check_keywords(values: Mapping[str, Any]) -> None:
-    known = (*field_hints(EnvConfig), *_SHORTCUTS)
+    base, values, origins = PRESETS[preset], {**overrides}, dict[str, str]()
+    assumed: tuple[str, ...] = ()
+    path = overrides.get("corridor")
+    if is_road_file(path):
+        road = read_road(path)
+        table = {key: value for key, value in road.environment.items() if key not in overrides}
+        estimator = overrides.get("estimator", table.get("estimator", base.estimator))
+        if _is_tuned_for_another(table.get("estimator_settings"), estimator):
+            del table["estimator_settings"]
+        origins = {"corridor": f"{path}: ", **dict.fromkeys(table, f"{path}: environment.")}
+        values, assumed = {**table, **overrides, "corridor": road.corridor}, road.assumed
     for key in values:
-        if key not in known:
-            hints = [f"it is a field of {name}, {name}={{{key!r}: ...}}; " for name in _owners(key)]
-            raise UnknownKeywordError(
-                f"{cut(key)} is unknown; {''.join(hints)}allowed: {', '.join(known)} (got an "
-                f"unexpected keyword argument {shown(key)})"
-            )
+        if key not in {*KEYWORDS, *SHORTCUTS}:
+            raise _unknown(key, origins.get(key, ""))
+    fields = read_keywords(values, {name: getattr(base, name) for name in KEYWORDS}, origins)
+    config = EnvConfig(**fields, origins=origins)
+    inherited = _inherited(config, values, assumed)
+    if not inherited:
+        return config
+    warnings.warn(
+        f"{', '.join(inherited)}: values measured or tuned on {base.corridor.name}, or assumed, "
+        "are used on another road or with other parameters; `dptse fit` fits parameters to a road "
+        "file, `dptse tune` tunes settings",
+        UserWarning,
+        stacklevel=1,  # one place, so that Python tells it once, however environments are made
+    )
+    return replace(config, inherited=inherited)
 
 
-def _owners(key: str) -> list[str]:
-    """Return the keywords that have a field of this name."""
+def _is_tuned_for_another(settings: Any, estimator: Any) -> bool:
+    """Return whether settings are a file of those that were tuned for another estimator."""
+    if not (isinstance(settings, str) and settings.endswith(".json")):
+        return False
+    name = estimator if isinstance(estimator, str) else ESTIMATORS.name_of(estimator)
+    return tuned_estimator(settings) != name
+
+
+def _unknown(key: str, origin: str) -> UnknownKeywordError:
+    """Return the error for a keyword that there is not, with those that have such a field."""
     # A plugin that nobody has used yet is a name.
     models = [each for each in RELEASE_MODELS.values() if not isinstance(each, str)]
     nested = {"privacy": [each.settings_type for each in models], "corridor": [Corridor]}
-    return [
-        name for name, types in nested.items() if any(key in field_hints(each) for each in types)
+    hints = [
+        f"it is a field of {name}, {name}={{{key!r}: ...}}; "
+        for name, types in nested.items()
+        if any(key in field_hints(each) for each in types)
     ]
-
-
-def _corridor(base: Corridor, values: dict[str, Any]) -> Corridor:
-    """Take the keywords about the corridor out of ``values`` and apply them."""
-    given = values.pop("corridor", {})
-    corridor = base.replaced(given) if isinstance(given, Mapping) else find_corridor(given)
-    for key, names in (("demand", ()), ("incident", ("none",))):
-        if key in values:
-            value = values.pop(key)
-            if isinstance(value, str):
-                require_name(key, value, ("preset", "random", *names))
-                source = randomised(corridor) if value == "random" else corridor
-                value = None if value == "none" else getattr(source, key)
-            corridor = corridor.replaced({key: value})
-    return corridor
+    return UnknownKeywordError(
+        f"{origin}{cut(key)} is unknown; {''.join(hints)}allowed: "
+        f"{', '.join((*KEYWORDS, *SHORTCUTS))} (got an unexpected keyword argument {shown(key)})"
+    )
 
 
 def _inherited(
-    corridor: Corridor, config: EnvConfig, given: Mapping[str, Any], assumed: tuple[str, ...]
+    config: EnvConfig, given: Mapping[str, Any], assumed: tuple[str, ...]
 ) -> tuple[str, ...]:
     """Return the keywords whose values are of another road or parameter set, or assumed."""
-    shipped = [preset.corridor for preset in PRESETS.values()]
-    is_other_road = not any(corridor.has_geometry_of(road) for road in shipped)
+    corridor, parameters = config.corridor, config.arz_parameters
+    is_other_road = not any(corridor.has_geometry_of(each.corridor) for each in PRESETS.values())
     found = []
     if is_other_road:
         found = [f"corridor.{name}" for name in assumed]
@@ -502,7 +630,6 @@ def _inherited(
             found.append("corridor.average_dwell")
         if isinstance(config.parameters, str) and "parameters" not in given:
             found.append("parameters")
-    parameters = config.arz_parameters
     is_other = is_other_road or parameters != load_parameters(tuned_with(parameters))
     if is_other and config.settings_name is not None and "estimator_settings" not in given:
         found.append("estimator_settings")
@@ -512,30 +639,3 @@ def _inherited(
         spans = max(config.query_spans)
         found += inherits(corridor, centre is not None, spans, config.settings())
     return tuple(found)
-
-
-def _privacy(base: PrivacySettings, values: dict[str, Any]) -> PrivacySettings:
-    """Take the keywords about privacy out of ``values`` and apply them.
-
-    A change of the release model keeps epsilon and delta and takes the model's defaults otherwise.
-    """
-    given = values.pop("privacy", {})
-    if isinstance(given, PrivacySettings):
-        base, given = given, {}
-    elif isinstance(given, str | type):
-        given = {"preset": given}
-    elif not isinstance(given, Mapping):
-        raise ValueError(
-            f"privacy must be the name of a release model, a class or a mapping, got {shown(given)}"
-        )
-    given = dict(given)
-    preset = given.pop("preset", base.preset)
-    if not isinstance(preset, str | type):
-        raise ValueError(f"privacy.preset must be a name or a class, got {shown(preset)}")
-    if isinstance(preset, str):
-        preset = RELEASE_MODELS.name_of(preset)
-    if preset != base.preset:
-        model = RELEASE_MODELS.find(preset)
-        base = model.settings_type(preset=preset, epsilon=base.epsilon, delta=base.delta)
-    given |= {key: values.pop(key) for key in ("epsilon", "delta") if key in values}
-    return from_mapping(type(base), given, "privacy", base)

@@ -9,13 +9,14 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.config import check_road, resolve
+from dptse_env.config import resolve
+from dptse_env.estimators import check_settings, require_time_step
 from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import BoolArray
-from dptse_env.utils.fields import require
+from dptse_env.utils.fields import require, within
 
 
 class QueryEnvBase:
@@ -57,7 +58,10 @@ class QueryEnvBase:
         self.config, self.render_mode = config, render_mode
         self.interface = make_interface(config)
         self._model = make_model(config)
-        check_road(config, self._model, overrides)
+        with within(config.origins.get("corridor", "")):
+            require_time_step(config.estimator, self._model)
+        with within(config.origins.get("estimator_settings", "")):
+            check_settings(config.estimator, self._model, config.settings())
         self._library, self._threads = open_library(records), threads
         self._n_episodes = n_episodes
         self._process: QueryProcess | None = None

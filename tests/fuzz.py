@@ -39,6 +39,7 @@ import polars as pl
 
 import dptse_env
 from agents.policies import find_policy
+from dptse_env import config
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS, settings_type
 from dptse_env.estimators.settings import available_settings, load_settings, write_settings
@@ -74,10 +75,7 @@ LONGEST_MESSAGE = 1500
 """Characters of a message, its path aside."""
 
 SHIPPED = Path(dptse_env.__file__).parent
-KEYWORDS = (
-    *(name for name in field_hints(EnvConfig) if name != "inherited"),
-    "epsilon", "delta", "incident", "demand",
-)  # fmt: skip
+KEYWORDS = (*config.KEYWORDS, *config.SHORTCUTS)
 PATHS = (*KEYWORDS, r"no_such\nkeyword", "none.toml", "none.json")
 """Beginnings of messages on a configuration."""
 

@@ -10,12 +10,11 @@ import pytest
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 import dptse_env.env
-from dptse_env.config import PRESETS, EnvConfig, resolve
+from dptse_env.config import KEYWORDS, PRESETS, SHORTCUTS, resolve
 from dptse_env.env import SensorQueryEnv
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.spaces.observations import BLOCKS
-from dptse_env.utils.fields import field_hints
 from tests.helpers import SHORT
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
@@ -79,8 +78,7 @@ def test_its_arguments_are_all_there_are_and_give_the_defaults():
     assert {name: defaults.pop(name) for name in own} == {
         name: signature[name].default for name in own
     }
-    shortcuts = {"epsilon", "delta", "incident", "demand"}
-    assert {*defaults} == {*field_hints(EnvConfig)} - {"inherited"} | shortcuts
+    assert {*defaults} == {*KEYWORDS, *SHORTCUTS}
     assert resolve("paper-highway", defaults) == PRESETS["paper-highway"]
 
 

@@ -173,7 +173,7 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
         keywords["bandwidth"] = third
         decided.append("bandwidth")
         remarks.append(f"bandwidth {third}, a third of the segments")
-    is_field = corridor.recordings is not None and not has_vehicles(corridor.recordings)
+    is_field = not has_vehicles(corridor.recordings)
     needs_vehicles = RELEASE_MODELS.find(base.privacy.preset).needs_vehicles
     if is_field and needs_vehicles and "privacy" not in keywords:
         keywords["privacy"] = "corrected"

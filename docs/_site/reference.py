@@ -30,7 +30,7 @@ def keyword_table(path: str) -> str:
     }
     lines = ["| keyword | values | default | meaning |", "| :-- | :-- | :-- | :-- |"]
     for field in dataclasses.fields(cls):
-        if field.name in meanings:
+        if field.name in meanings and field.compare:  # else `resolve` fills it in
             allowed, meaning = values(hints[field.name]), meanings[field.name]
             lines.append(f"| `{field.name}` | {allowed} | {default(field)} | {meaning} |")
     return "\n".join(['<div class="keywords" markdown>', "", *lines, "", "</div>"])

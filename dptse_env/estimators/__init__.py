@@ -44,6 +44,7 @@ __all__ = [
     "check_settings",
     "checked_settings",
     "make_estimator",
+    "require_time_step",
     "settings_type",
 ]
 
@@ -107,19 +108,28 @@ def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
             it steps the model and its time step violates the CFL condition.
     """
     check_demand(estimator, settings)
-    part = ESTIMATORS.find(estimator)
-    if _steps_model(part):
-        try:
-            model.require_time_step()
-        except ValueError as problem:
-            free = ", ".join(name for name in ESTIMATORS if not _steps_model(ESTIMATORS.find(name)))
-            raise ValueError(
-                f"{problem}; or choose other parameters, or an estimator that does not step the "
-                f"model: {free}"
-            ) from problem
-    check = getattr(part, "check_settings", None)
+    require_time_step(estimator, model)
+    check = getattr(ESTIMATORS.find(estimator), "check_settings", None)
     if check is not None:
         check(with_demand(model, settings), settings)
+
+
+def require_time_step(estimator: Any, model: ARZModel) -> None:
+    """Refuse a road whose segments are too short for an estimator that steps the model.
+
+    Raises:
+        ValueError: The model's time step violates the CFL condition.
+    """
+    if not _steps_model(ESTIMATORS.find(estimator)):
+        return
+    try:
+        model.require_time_step()
+    except ValueError as problem:
+        free = ", ".join(name for name in ESTIMATORS if not _steps_model(ESTIMATORS.find(name)))
+        raise ValueError(
+            f"{problem}; or choose other parameters, or an estimator that does not step the "
+            f"model: {free}"
+        ) from problem
 
 
 def _steps_model(part: Any) -> bool:

@@ -12,6 +12,7 @@ from dptse_env.estimators.settings import EstimatorSettings, RecurrentSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.network import RoadNetwork
 from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.fields import within
 
 LEAST_VARIANCE = 1e-12
 
@@ -55,7 +56,8 @@ class Mixture(BatchEstimator):
         from dptse_env.estimators import check_settings  # noqa: PLC0415 (which names this module)
 
         for kind, own in _experts(settings):
-            check_settings(kind, model, own)
+            with within("estimator_settings.mixture.experts: "):
+                check_settings(kind, model, own)
 
     @staticmethod
     def inherits(

@@ -68,12 +68,7 @@ class QueryOptions:
             levels: The keyword ``price_levels``.
             unit: The keyword ``bandwidth_unit``.
             separate_sensors: See the attribute.
-
-        Raises:
-            ValueError: Spans or levels are none, repeated or out of order, there are too many
-                options, or the bandwidth pays for none of them.
         """
-        _check(n_mainline, bandwidth, spans, levels, unit)
         groups = [(span, level) for span in spans for level in levels]
         sizes = [n_mainline - span + 1 for span, _ in groups]
         span = np.repeat(np.array([span for span, _ in groups], dtype=np.int64), sizes)
@@ -165,13 +160,16 @@ class QueryOptions:
         return {int(self.first[option]): int(option) for option in single}
 
 
-def _check(
-    n: int, bandwidth: int, spans: Sequence[int], levels: Sequence[float], unit: BandwidthUnit
-) -> None:
+def check_spans(n: int, spans: Sequence[int]) -> None:
+    """Raise ``ValueError`` unless `spans` are ascending numbers of the n mainline segments."""
     if not spans or list(spans) != sorted(set(spans)) or not 1 <= spans[0] <= spans[-1] <= n:
         raise ValueError(
             f"query_spans must be ascending, distinct numbers of segments in 1..{n}, got {spans}"
         )
+
+
+def check_levels(n: int, spans: Sequence[int], levels: Sequence[float]) -> None:
+    """Raise ``ValueError`` unless `levels` are distinct and leave at most `MOST_OPTIONS`."""
     if not levels or len(set(levels)) < len(levels):
         raise ValueError(f"price_levels must be distinct factors, got {levels}")
     n_options = len(levels) * sum(n - span + 1 for span in spans)
@@ -179,10 +177,4 @@ def _check(
         raise ValueError(
             f"query_spans and price_levels must leave at most {MOST_OPTIONS} queries to choose "
             f"from, got {n_options}"
-        )
-    cheapest = spans[0] if unit == "segments" else 1
-    if bandwidth < cheapest:
-        raise ValueError(
-            f"bandwidth must be in {cheapest}..{n}, to pay for a query of {spans[0]} segments, got "
-            f"{bandwidth}"
         )

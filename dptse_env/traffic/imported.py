@@ -88,18 +88,18 @@ def recorded_seeds(recordings: Recordings) -> tuple[int, ...]:
     return tuple(sorted(map(int, _manifest(recordings)["records"])))
 
 
-def has_vehicles(recordings: Recordings) -> bool:
-    """Return whether the records have vehicles; errors are those of `recorded_seeds`."""
-    return bool(_manifest(recordings)["kind"] == "vehicles")
+def has_vehicles(recordings: Recordings | None) -> bool:
+    """Return whether the records have vehicles, as simulated ones do; may raise as above."""
+    return recordings is None or bool(_manifest(recordings)["kind"] == "vehicles")
 
 
-def require_seeds(recordings: Recordings, seeds: Iterable[int]) -> None:
-    """Raise ``ValueError`` unless there is a record of each of `seeds`."""
+def require_seeds(recordings: Recordings, seeds: Iterable[int], path: str = "traffic seed") -> None:
+    """Raise ``ValueError``, with the path of the seeds, unless there is a record of each."""
     known = recorded_seeds(recordings)
     lacking = sorted(set(seeds) - set(known))
     if lacking:
         raise ValueError(
-            f"traffic seed must be one that was recorded ({ranges(known):.200} in "
+            f"{path} must be one that was recorded ({ranges(known):.200} in "
             f"{recordings.folder}), got {ranges(lacking):.200}"
         )
 

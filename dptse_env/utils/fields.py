@@ -15,7 +15,8 @@ import reprlib
 import tomllib
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -287,6 +288,21 @@ def cut(value: Any) -> str:
 
 
 _NON_NEGATIVE = Interval(0, math.inf, open_high=True)
+
+
+@contextmanager
+def within(place: str) -> Iterator[None]:
+    """Put a place, such as ``"road.toml: "``, in front of messages on bad values in the body.
+
+    Raises:
+        ValueError: As the body; unchanged where the place is empty.
+    """
+    try:
+        yield
+    except ValueError as problem:
+        if not place:
+            raise
+        raise ValueError(f"{place}{problem}") from problem
 
 
 def require(condition: bool, path: str, allowed: str, value: object) -> None:

@@ -15,9 +15,6 @@ PLUGINS = "dptse_env.plugins"
 """Group of entry points of other packages. Each names a function that registers their parts; it is
 called once, when a name is looked up that is not known yet."""
 
-OR_IMPORTED = ", or 'package.module:Name'"
-"""Addition to the names that a message allows; not so in files."""
-
 _PACKAGE = __name__.partition(".")[0]
 _plugins_loaded = False
 
@@ -119,8 +116,8 @@ class Registry(Mapping[str, Any]):
             load_plugins()
         if value not in self._parts and ":" not in value:
             raise ValueError(
-                f"{self.keyword} must be one of {', '.join(self._parts)}{OR_IMPORTED}, got "
-                f"{shown(value)}"
+                f"{self.keyword} must be one of {', '.join(self._parts)}, or, outside of files, "
+                f"'package.module:Name', got {shown(value)}"
             )
         return value
 

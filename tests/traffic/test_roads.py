@@ -134,9 +134,12 @@ def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
     ("line", "message"),
     [
         ("bandwidth = 0", r"environment\.bandwidth must be an integer in 1"),
-        ('estimator = "best"', r"environment\.estimator must be one of .*, mixture, got 'best'"),
+        (
+            'estimator = "best"',
+            r"environment\.estimator must be one of .*, mixture, or, .*, got 'best'",
+        ),
         ("epsilon = 0", r"environment\.privacy\.epsilon must be"),
-        ('incident = "some"', r"environment\.incident must be one of"),
+        ('incident = "some"', r"environment\.corridor\.incident must be one of"),
         ('"a\\nb" = 0', r"environment\.a\\nb is unknown"),
         ("bandwidth = 9", r"environment\.bandwidth must be in 1\.\.8, got 9"),
     ],
