@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from dptse_env.importers.folder import ROAD, measure, save_records
+from dptse_env.importers.folder import ROAD, save_records
+from dptse_env.importers.measured import measure
 from dptse_env.traffic import Corridor, Record, RecordLibrary
 from dptse_env.traffic.demand import Demand, Drivers, Incident, VehicleClass
 from dptse_env.traffic.imported import Kind

@@ -20,11 +20,12 @@ from dptse_env.importers.folder import (
     new_folder,
     save_records,
 )
+from dptse_env.importers.measured import with_measured
 from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
 from dptse_env.traffic.corridor import SHORTEST_SEGMENT, Corridor
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.imported import ranges
-from dptse_env.traffic.record import Record, average_dwell
+from dptse_env.traffic.record import Record
 from dptse_env.traffic.roads import DENSITY_SCALE, write_corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
 from dptse_env.utils.fields import (
@@ -525,12 +526,8 @@ def import_field(
     ]
     n_training = len(seeds[splits[0].name])
     entering = np.mean([window[:, 0].prod(axis=-1).mean() for window in windows[:n_training]])
-    measured = dataclasses.replace(
-        bare,
-        demand=Demand(mainline=((0.0, round(float(entering), 1)),)),
-        average_dwell=round(average_dwell(bare, records[:n_training]), 3),
-        measured=("demand", "average_dwell"),
-    )
+    demand = Demand(mainline=((0.0, round(float(entering), 1)),))
+    measured = with_measured(bare, records[:n_training], demand)
     sources: list[dict[str, Any]] = [
         {"seed": seed, "file": source.density.name, "start": start}
         for seed, start in zip(flat, starts, strict=True)

@@ -8,23 +8,22 @@ import errno
 import itertools
 import os
 import shutil
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from dptse_env.importers.measured import measure
 from dptse_env.importers.placing import Branches
 from dptse_env.importers.recording import Options, Recording
 from dptse_env.importers.report import write_report
 from dptse_env.importers.source import Source
 from dptse_env.importers.tables import FORMATS
 from dptse_env.traffic.corridor import Corridor, Recordings
-from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.imported import Kind, load_record, ranges, save_record, write_manifest
-from dptse_env.traffic.record import Record, average_dwell
+from dptse_env.traffic.record import Record
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.fields import require, require_name
 from dptse_env.utils.files import hidden, left_hidden, require_output
@@ -34,8 +33,6 @@ NO_SPACE = 2**16
 """Free space below which a disk is full [bytes]."""
 DATES = 1e8
 """Times above are counted from a date [s], and not from the start of a file."""
-SMALLEST_SHARE = 0.001
-"""Exit shares must be above 0 and below 1: nobody or everybody leaving counts as this much."""
 
 
 class Split(NamedTuple):
@@ -199,51 +196,6 @@ def _overlaps(windows: Iterable[Mapping[str, Any]], duration: float) -> list[str
                 "on: the same vehicles may be in windows of both"
             ]
     return []
-
-
-def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corridor:
-    """Return a corridor with the demand, exit shares and average dwell of records.
-
-    The records are read twice. Flows are Edie's: the mean over time of the sum of speeds over the
-    length of a segment. That of the mainline is taken in its first segment, those of ramps in the
-    segment at their face.
-
-    Raises:
-        ValueError: No vehicle is on the mainline.
-
-    Warns:
-        UserWarning: No vehicle is ever on some of its segments.
-    """
-    sums, counts = np.mean(
-        [(record.speed_sums.mean(axis=0), record.counts.mean(axis=0)) for record in records()],
-        axis=0,
-    )
-    empty = np.flatnonzero(counts[: corridor.n_mainline] == 0.0)
-    some = "with vehicles on the mainline in the first part of the windows"
-    require(len(empty) < corridor.n_mainline, "files", some, "none there")
-    if len(empty):
-        warnings.warn(
-            f"no vehicle is on the mainline's segments {ranges(empty + 1)} of "
-            f"{corridor.n_mainline}: are layout.origin and the unit of lengths right?",
-            stacklevel=3,
-        )
-    flow = sums[: corridor.n_segments] / np.array(corridor.segment_lengths)
-    shares = [
-        flow[segments[0]] / max(flow[face - 1], 1e-9)
-        for face, segments in zip(corridor.off_ramps, corridor.off_ramp_segments, strict=True)
-    ]
-    entering = [flow[segments[-1]] for segments in corridor.on_ramp_segments]
-    held = np.clip(shares, SMALLEST_SHARE, 1.0 - SMALLEST_SHARE)
-    return dataclasses.replace(
-        corridor,
-        demand=Demand(
-            mainline=((0.0, round(float(flow[0]), 1)),),
-            on_ramps=tuple(round(float(each), 1) for each in entering),
-        ),
-        exit_shares=tuple(round(float(each), 4) for each in held),
-        average_dwell=round(average_dwell(corridor, records()), 3),
-        measured=("demand", "exit_shares", "average_dwell"),
-    )
 
 
 def check_splits(splits: Sequence[Split]) -> None:

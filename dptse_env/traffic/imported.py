@@ -25,9 +25,6 @@ LARGEST_MANIFEST = 10_000_000
 Kind = Literal["vehicles", "fields"]
 """Kind of the records of a folder."""
 
-_IMPORTS = {"vehicles": "import trajectories", "fields": "import field"}
-"""Commands that write folders of each kind."""
-
 _KEYS = {"format": str, "version": int, "kind": str, "road": dict, "records": dict, "sources": list}
 
 
@@ -158,12 +155,6 @@ def _manifest(recordings: Recordings) -> dict[str, Any]:
     except ValueError as problem:
         raise InvalidRecordError(str(problem)) from problem
     found = manifest["format"], manifest["version"]
-    if found == (FORMAT, 1):
-        command = _IMPORTS.get(manifest["kind"], _IMPORTS["vehicles"])
-        raise InvalidRecordError(
-            f"{path}: an earlier version wrote these recordings: import the files again with "
-            f"'dptse {command} ... --output FOLDER'"
-        )
     if found != (FORMAT, VERSION):
         raise InvalidRecordError(f"{path}: format must be {(FORMAT, VERSION)}, got {found!r:.100}")
     if _digest(manifest) != recordings.digest:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from dptse_env.importers.measured import with_measured
 from dptse_env.importers.sumo_net.configuration import Files
 from dptse_env.importers.sumo_net.segmentation import Segmentation
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, Profile
 from dptse_env.traffic.own_sumo import SumoScenario
-from dptse_env.traffic.record import Record, average_dwell
+from dptse_env.traffic.record import Record
 from dptse_env.traffic.recording import simulate_in_worker
 from dptse_env.traffic.roads import DENSITY_SCALE
 from dptse_env.traffic.sumo import RecordingError
@@ -25,9 +25,6 @@ from dptse_env.utils.files import file_digest
 
 NEVER = np.iinfo(np.int64).max
 """First step of a vehicle on a column where it never is."""
-
-LEAST_SHARE = 0.001
-"""Least exit share: a road has shares above 0 and below 1."""
 
 
 @dataclass(frozen=True)
@@ -97,13 +94,7 @@ def import_road(
     # First step of each vehicle on each column.
     first = np.full((record.n_vehicles, record.n_columns), NEVER)
     np.minimum.at(first, (record.vehicle, record.segment), record.step.astype(np.int64))
-    corridor = dataclasses.replace(
-        draft,
-        demand=_demand(draft, first),
-        exit_shares=_exit_shares(draft, first),
-        average_dwell=round(average_dwell(draft, [record]), 2),
-        measured=("demand", "exit_shares", "average_dwell"),
-    )
+    corridor = with_measured(draft, [record], _demand(draft, first), _exit_shares(draft, first))
     inside = (first.argmin(axis=1) < draft.n_mainline) & (first.min(axis=1) > 0)
     if inside.any():
         share = f"{inside.sum()} of {record.n_vehicles} vehicles"
@@ -209,19 +200,15 @@ def _demand(corridor: Corridor, first: IntArray) -> Demand:
     return Demand(mainline=rates(first[:, S]), on_ramps=tuple(map(rates, ramps)))
 
 
-def _exit_shares(corridor: Corridor, first: IntArray) -> tuple[float, ...]:
-    """Count the share of vehicles that leave, of those that pass each off-ramp."""
+def _exit_shares(corridor: Corridor, first: IntArray) -> Iterator[float]:
+    """Yield the share of vehicles that leave, of those that pass each off-ramp."""
 
     def reached(*columns: int) -> BoolArray:
         found: BoolArray = np.any(first[:, columns] < NEVER, axis=1)
         return found
 
     N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
-    shares = []
     for i, face in enumerate(corridor.off_ramps):
         left = reached(N + n_on + i, S + 2 + n_on + i)
         passed = reached(S, *range(face)) & reached(*range(face, N), S + 1) & ~left
-        n_left, n_all = int(left.sum()), int((left | passed).sum())
-        share = n_left / n_all if n_all else 0.0
-        shares.append(round(min(max(share, LEAST_SHARE), 1.0 - LEAST_SHARE), 4))
-    return tuple(shares)
+        yield left.sum() / max((left | passed).sum(), 1)
