@@ -20,7 +20,6 @@ REGISTRIES = {
     "action": "dptse_env.spaces.actions:ACTION_ENCODINGS",
     "corridor": "dptse_env.traffic:CORRIDORS",
     "estimator": "dptse_env.estimators:ESTIMATORS",
-    "pacing": "dptse_env.release:PACINGS",
     "observation": "dptse_env.spaces.observations:BLOCKS",
     "privacy": "dptse_env.release:RELEASE_MODELS",
     "reward": "dptse_env.spaces.rewards:REWARDS",

@@ -52,7 +52,7 @@ from dptse_env.model import ARZParameters, load_parameters
 from dptse_env.model.parameters import write_parameters
 from dptse_env.policies import read_policy, shipped_policies
 from dptse_env.registration import ENVIRONMENTS
-from dptse_env.release import PACINGS, RELEASE_MODELS
+from dptse_env.release import RELEASE_MODELS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.spaces.observations import BLOCKS
 from dptse_env.spaces.rewards import REWARDS
@@ -182,8 +182,6 @@ def keyword(name, rng, given):
         case "privacy":
             preset = one_of(RELEASE_MODELS, rng)
             fields = some_fields(RELEASE_MODELS.find(preset).settings_type, rng, 0.02)
-            if "pacing" in fields:
-                fields["pacing"] = one_of(PACINGS, rng)
             return {**fields, "preset": preset}
     return some(hints[name], rng)
 
@@ -227,7 +225,7 @@ def roads(rng, folder):
     """Draw a road file."""
     path = folder / "road.toml"
     table = {"bandwidth": 2, "horizon": 5, "traffic_seeds": [0], "estimator": "ekf",
-             "observation": ["default"], "privacy": {"preset": "paced", "pacing": "tracer"},
+             "observation": ["default"], "privacy": {"preset": "paced"},
              "estimator_settings": {"process_noise": [0.01, 0.01]}}  # fmt: skip
     write_corridor(path, dataclasses.replace(SHORT_HIGHWAY, duration=60, incident=None), table)
     path.write_bytes(changed(path.read_bytes(), rng))

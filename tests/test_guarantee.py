@@ -15,7 +15,7 @@ from dptse_env.estimators import Estimate
 from dptse_env.parts import make_parts, make_release
 from dptse_env.privacy import ROUNDING, mu_of
 from dptse_env.process import QueryProcess
-from dptse_env.release import CappedSettings, Detectors, PacedSettings, Pacing, Request
+from dptse_env.release import CappedSettings, Detectors, Paced, PacedSettings, Pacing, Request
 from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
 from tests.helpers import AWAY, fast_and_slow, make_env, play, record
 from tests.release.worlds import ONE, Worlds
@@ -89,7 +89,7 @@ def test_what_vehicles_have_spent_is_shown_with_the_truth(privacy, what, most):
 def test_a_spec_with_every_keyword_of_paced_ledgers_survives_json():
     privacy = {
         "epsilon": 2.0, "delta": 0.01, "unit": "event", "adjacency": "add_remove", "pace": 0.6,
-        "clip": 25.0, "ratio": 3.0, "pacing": "tracer", "boundary_inputs": "private",
+        "clip": 25.0, "ratio": 3.0, "boundary_inputs": "private",
     }  # fmt: skip
     given = {"privacy": privacy, "traffic_seeds": "0:2", "horizon": 20}
     env = gym.make("dptse_env:dptse/PrivateHighway-v1", **given)
@@ -124,6 +124,14 @@ class Reckless(Pacing):
             [0.0, -0.3, -1.0, -2.0, -3.0, -6.0], observed.shape[1]
         )
         return np.tile(self.budget[self.task.group] * 10.0**powers, (len(observed), 1))
+
+
+class RecklesslyPaced(Paced):
+    """`Paced` at prices of `Reckless`."""
+
+    def __init__(self, task, traffic):
+        super().__init__(task, traffic)
+        self.pacing = Reckless(task, self.pacing.budget)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,11 +226,11 @@ def configuration(one_of):
     }
     if is_paced:
         privacy = PacedSettings(
+            one_of("paced", RecklesslyPaced),
             **given,
             unit=one_of("trip", "trip", "event"),
             clip=one_of(7.3, 25.0, 150.0),
             ratio=one_of(0.3, 1.0) if adjacency == "replace" else one_of(1.0, 30.0),
-            pacing=one_of("tracer", Reckless),
         )
         options = {
             "query_spans": one_of((1,), (2,), (1, 2), (1, 2, 3)[:span]),
@@ -381,6 +389,14 @@ class AtOnce(Pacing):
         return np.tile(next(self.parts, 2.0**-54) * whole, (len(observed), 1))
 
 
+class PacedAtOnce(Paced):
+    """`Paced` at prices of `AtOnce`."""
+
+    def __init__(self, task, traffic):
+        super().__init__(task, traffic)
+        self.pacing = AtOnce(task, self.pacing.budget)
+
+
 EXIT, FAST_ONE, NOBODY = ROAD.n_segments + 1, (1, 150.0), (AWAY, 0.0)
 BOTH_SEE = {"penetration": Known(share=0.5), "detectors": Detectors(budget_share=0.6)}
 OVERLAPPING = {"query_spans": (1, 2), "price_levels": (0.5, 4.0)}
@@ -392,9 +408,9 @@ WORST = {
     "capped, every second, at the boundary": (
         CappedSettings(cap=HORIZON, boundary_inputs="private"), {}, (EXIT, 0.0), (1, 0.0),
     ),
-    "paced": (PacedSettings(pacing=AtOnce), {}, (1, 0.0), (3, 0.0)),
+    "paced": (PacedSettings(PacedAtOnce), {}, (1, 0.0), (3, 0.0)),
     "paced, by queries and sensors": (
-        PacedSettings(pacing=AtOnce, adjacency="add_remove"), BOTH_SEE, NOBODY, (1, 0.0),
+        PacedSettings(PacedAtOnce, adjacency="add_remove"), BOTH_SEE, NOBODY, (1, 0.0),
     ),
     "paced, a second, by overlapping queries": (
         PacedSettings(unit="event", adjacency="add_remove"), OVERLAPPING, (1, 0.0), NOBODY,

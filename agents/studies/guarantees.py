@@ -128,7 +128,7 @@ def priced(estimator: str, protection: str = TRIP, **changes: Any) -> Cell:
 
 SETTINGS: dict[str, Any] = {
     "epsilon": 5.0, "delta": DELTA, "adjacency": "replace", "unit": "trip",
-    "pace": 0.85, "clip": 25.0, "ratio": 1.0, "pacing": "tracer",
+    "pace": 0.85, "clip": 25.0, "ratio": 1.0,
 }  # fmt: skip
 """Privacy settings of a cell of the ledgers, but for what it varies."""
 BASE = SETTINGS | {
@@ -137,8 +137,8 @@ BASE = SETTINGS | {
 }  # fmt: skip
 LACKS = {
     "paced": (),
-    "capped": ("pace", "clip", "ratio", "pacing"),
-    "exact": ("epsilon", "delta", "adjacency", "unit", "pace", "ratio", "pacing"),
+    "capped": ("pace", "clip", "ratio"),
+    "exact": ("epsilon", "delta", "adjacency", "unit", "pace", "ratio"),
 }
 """Value of a setting that a release model does not have."""
 QUERIES: dict[str, dict[str, Any]] = {

@@ -20,7 +20,7 @@ from dptse_env.release.gaussian import (
     require_gaussian,
 )
 from dptse_env.release.paced import Paced, PacedSettings
-from dptse_env.release.pacing import PACINGS, Pacing
+from dptse_env.release.pacing import Pacing
 from dptse_env.release.queries import MOST_OPTIONS, BandwidthUnit, QueryOptions
 from dptse_env.release.report import VOID_REASONS, PrivacyReport, QuantityReport
 from dptse_env.release.sensors import DetectorErrors, Detectors, make_groups
@@ -43,7 +43,6 @@ every query policy."""
 __all__ = [
     "BOUNDARIES",
     "MOST_OPTIONS",
-    "PACINGS",
     "RELEASE_MODELS",
     "VOID_REASONS",
     "BandwidthUnit",

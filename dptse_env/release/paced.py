@@ -29,14 +29,13 @@ from dptse_env.release.base import (
     Task,
 )
 from dptse_env.release.noise import Noise
-from dptse_env.release.pacing import PACINGS, EventPacing, check_prices
+from dptse_env.release.pacing import EventPacing, Pacing, TripPacing
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.vehicles import Ledgers, Traffic, require_exact_sums
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval
 from dptse_env.utils.kernels import Bundle, kernel
-from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.vector_info import Infos, object_array
 
 PacedUnit = Literal["trip", "event"]
@@ -57,8 +56,6 @@ class PacedSettings(PrivacySettings):
         ratio: Ratio r of the charge for a deviation of D and the charge for being counted; noise
             of flows has D / sqrt(r) times the deviation of that of counts. At most 1 for the
             adjacency ``replace``.
-        pacing: Rule that sets the prices: ``tracer``, a registered name,
-            ``"package.module:Class"``, or a class.
 
     Raises:
         ValueError: A field is out of range; the message names its path below ``privacy``.
@@ -72,12 +69,10 @@ class PacedSettings(PrivacySettings):
     pace: Annotated[float, Interval(0.05, 1)] = 0.85
     clip: Annotated[float, Interval(1, 200)] = 25.0
     ratio: Annotated[float, Interval(0.01, 100)] = 1.0
-    pacing: Any = "tracer"
 
     def __post_init__(self) -> None:
         """Check the fields, and that they are compatible."""
         super().__post_init__()
-        PACINGS.find(self.pacing)
         if self.ratio > 1.0 and self.adjacency == "replace":
             raise ValueError(
                 "privacy.ratio must be at most 1 for privacy.adjacency 'replace', where two "
@@ -141,10 +136,9 @@ class Paced(ReleaseModel):
             clip=settings.clip,
             fastest=task.corridor.largest_speed_limit,
         )
-        pacing = EventPacing if settings.unit == "event" else PACINGS.find(settings.pacing)
+        pacing = EventPacing if settings.unit == "event" else TripPacing
         # A pacing that offers the whole budget at once stays below what ledgers hold back.
-        self.pacing = pacing(task, (1.0 - 2.0 * ROUNDING) * self.budget)
-        self._checks_prices = is_foreign(self.pacing)
+        self.pacing: Pacing = pacing(task, (1.0 - 2.0 * ROUNDING) * self.budget)
         self.noise = Noise(n, task.n_columns, settings.noise)
         self.prices = np.zeros((n, task.n_columns))
         # The largest payments that a vehicle can have made in each group.
@@ -194,8 +188,6 @@ class Paced(ReleaseModel):
         task, episodes, observed = self.task, request.episodes, request.observed
         predicted, centre = self._predicted(request)
         prices = self.pacing.prices(episodes, observed, *predicted)
-        if self._checks_prices:
-            prices = check_prices(prices, observed.shape)
         sigma = np.empty((*prices.shape, 2))
         _charge(self._accounts, episodes, observed, prices, self._flow_noise, sigma)
         sums, self._refused[episodes] = self.collect(request, prices, centre, sigma)

@@ -8,7 +8,7 @@ releases are, never whether the guarantee holds. Each group of columns is paced 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from dptse_env.release.base import Task
 from dptse_env.release.queries import QueryOptions
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
-from dptse_env.utils.registry import Registry
 
 MEAN_SQUARE = 0.15
 """Expected value of d^2 / D^2, by which a contribution costs more than its price."""
@@ -31,9 +30,6 @@ SLOWEST, FASTEST = 8.0, 102.0
 
 MARGIN = 2.0
 """Queried seconds added to those that are expected for the rest of a trip [s]."""
-
-LEAST_PRICE = 2.0**-76
-"""Least price of a pacing [1/veh^2]: noise, of flows too, stays below `LARGEST_SIGMA`."""
 
 MEMORY = 60.0
 """Time constant of the average by which rates of querying follow the queries [s]."""
@@ -120,7 +116,7 @@ class Pacing(ABC):
     def prices(
         self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
     ) -> FloatArray:
-        """Return the price [1/veh^2] of every column, `LEAST_PRICE` or more, shape (k, C).
+        """Return the price [1/veh^2] of every column, above zero, shape (k, C).
 
         It is called once for every second, before its release.
 
@@ -143,8 +139,8 @@ class Pacing(ABC):
         return np.zeros((len(episodes), self.task.corridor.n_mainline))
 
 
-class TracerPacing(Pacing):
-    """Prices that spend what is left of a budget evenly over the rest of a trip.
+class TripPacing(Pacing):
+    """Prices for the unit ``trip``: they spend what is left of a budget evenly over its rest.
 
     A tracer m follows the mean ledger of the vehicles on each segment: a query adds its expected
     charge, ``a (1 + 0.15 r)``, predicted flows carry it along, and vehicles enter with 0. The rest
@@ -233,38 +229,6 @@ class EventPacing(Pacing):
     def expected_prices(self, speed: FloatArray) -> FloatArray:
         """Return the prices where queries do not overlap."""
         return self._whole
-
-
-PACINGS = Registry(
-    "privacy.pacing",
-    {"tracer": TracerPacing},
-    check=lambda part: (
-        None
-        if isinstance(part, type) and issubclass(part, Pacing)
-        else "be a subclass of dptse_env.release.Pacing"
-    ),
-)
-"""Pacings by name."""
-
-
-def check_prices(prices: Any, shape: tuple[int, ...]) -> FloatArray:
-    """Return the prices of a pacing; refuse those that are malformed.
-
-    Raises:
-        ValueError: Their shape is wrong, or one is below `LEAST_PRICE` or not finite.
-    """
-    array = np.asarray(prices)
-    if array.shape != shape or array.dtype.kind != "f":
-        raise ValueError(
-            f"privacy.pacing must return floats of shape {shape}, got {array.dtype} of shape "
-            f"{array.shape}"
-        )
-    bad = array[~((array >= LEAST_PRICE) & np.isfinite(array))]
-    if bad.size:
-        raise ValueError(
-            f"privacy.pacing must return finite prices >= {LEAST_PRICE:.3g}, got {bad[0]:.3g}"
-        )
-    return array
 
 
 @kernel

@@ -19,9 +19,8 @@ from agents.audit.residuals import RISK, examine
 from dptse_env.config import resolve
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of, mu_of
-from dptse_env.release import Paced, PacedSettings, Pacing
+from dptse_env.release import Paced, PacedSettings
 from dptse_env.release.noise import LARGEST_SIGMA, Noise
-from dptse_env.release.pacing import LEAST_PRICE
 from tests.helpers import AWAY, record
 
 from .worlds import (
@@ -161,25 +160,14 @@ def test_a_fall_back_is_told_of_its_own_episode():
     assert two.public(BOTH)["centre_fallback"].tolist() == [1.0, 0.0]
 
 
-def test_another_pacing_sets_the_prices_and_bad_ones_are_refused():
-    class Other(Pacing):
-        def prices(self, episodes, observed, density, speed):
-            return answer
-
-    release = started(pacing=Other)
-    answer = np.full((1, COLUMNS), 0.04)
+def test_a_price_buys_noise_of_its_deviation_and_one_whose_noise_is_not_exact_is_refused():
+    release, prices = started(), np.full((1, COLUMNS), 0.04)
+    release.pacing.prices = lambda *args: prices
     assert release.release(request(1)).sigma[0, 0, 0] == pytest.approx(5.0 / LENGTH)
-    answer = answer - 1.0
-    with pytest.raises(ValueError, match=r"^privacy\.pacing must return finite"):
-        release.release(request(1))
-
-
-@pytest.mark.parametrize("ratio", [0.01, 1.0])
-def test_the_least_prices_have_noise_that_is_exact(ratio):
-    release = started(ratio=ratio, clip=200.0)
-    least = np.full((1, COLUMNS), LEAST_PRICE)
-    release.pacing.prices = lambda *args: least
-    assert 2**38 <= release.release(request(1)).sigma.max() * LENGTH <= LARGEST_SIGMA
+    for bad in (-0.1, 0.0, np.nan, 0.9 / LARGEST_SIGMA**2):
+        prices[:] = bad
+        with pytest.raises(ValueError, match=r"^privacy\.epsilon must be such that noise"):
+            release.release(request(1))
 
 
 def test_a_report_above_the_limit_counts_as_the_limit():
@@ -326,8 +314,6 @@ def test_the_report_says_what_is_guaranteed(unit, adjacency):
         ({"clip": math.inf}, r"clip must be .* \[1, 200\], got inf$"),
         ({"ratio": 1.0001}, r"ratio must be at most 1 for .*, got 1\.0001$"),
         ({"unit": "horizon"}, r"unit must be one of 'trip', 'event', got 'horizon'$"),
-        ({"pacing": "fast"}, r"pacing must be one of tracer, .*got 'fast'"),
-        ({"pacing": dict}, r"pacing .* must be a subclass of .*release\.Pacing"),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named_with_their_path(fields, message):

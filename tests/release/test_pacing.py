@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dptse_env.model.network import make_layout
-from dptse_env.release import PACINGS, Group, Paced, PacedSettings, QueryOptions, Task
-from dptse_env.release.pacing import LEAST_PRICE, EventPacing, TracerPacing, check_prices
+from dptse_env.release import Group, Paced, PacedSettings, QueryOptions, Task
+from dptse_env.release.pacing import EventPacing, TripPacing
 from dptse_env.traffic import SHORT_HIGHWAY
 from tests.helpers import UNEVEN
 
@@ -23,7 +23,7 @@ TWO = Group("queries", 0.75), Group("sensors", 0.25)
 
 
 def make(
-    kind=TracerPacing, *, road=SHORT_HIGHWAY, bandwidth=3, spans=(1,), levels=(1.0,), sensors=(),
+    kind=TripPacing, *, road=SHORT_HIGHWAY, bandwidth=3, spans=(1,), levels=(1.0,), sensors=(),
     boundary="nominal", n_episodes=1, groups=WHOLE,
 ):  # fmt: skip
     """A pacing of half the road a second, unless another bandwidth is given."""
@@ -56,7 +56,7 @@ def seconds_on(speed, length=LENGTH):
 
 
 class PlainTracer:
-    """A `TracerPacing` of one episode and one group, with its part of the budget."""
+    """A `TripPacing` of one episode and one group, with its part of the budget."""
 
     def __init__(self, task, group):
         self.task, self.budget = task, BUDGET * task.shares[group]
@@ -230,26 +230,3 @@ def test_single_queries_of_a_second_have_the_whole_of_their_group_s():
     np.testing.assert_allclose(prices, whole * np.where(np.arange(9) < N, 0.75, 0.25))
     np.testing.assert_allclose(pacing.expected_prices(np.full(S, 60.0)), [0.75, 0.25])
     assert not pacing.tracer(ONE).any()
-
-
-# --- pacings of other packages ---------------------------------------------------------------
-
-
-def test_good_prices_pass_and_bad_ones_are_named():
-    good = np.array([[0.5, 1.0]])
-    assert check_prices(good, (1, 2)) is good
-    assert check_prices([[LEAST_PRICE, 1.0]], (1, 2)).tolist() == [[LEAST_PRICE, 1.0]]
-    for bad in (good[0], good.astype(int), None, "high"):
-        with pytest.raises(ValueError, match=r"^privacy\.pacing must return floats of shape"):
-            check_prices(bad, (1, 2))
-    for value in (0.0, -0.1, np.nan, np.inf, 0.9 * LEAST_PRICE):
-        with pytest.raises(ValueError, match=r"^privacy\.pacing must return finite prices >= 1"):
-            check_prices(np.array([[0.5, value]]), (1, 2))
-
-
-def test_pacings_are_found_by_name():
-    for good in ("tracer", TracerPacing, "dptse_env.release.pacing:TracerPacing"):
-        assert PACINGS.find(good) is TracerPacing
-    for bad, message in (("greedy", "must be one of tracer"), (dict, ".*subclass of .*Pacing")):
-        with pytest.raises(ValueError, match=rf"^privacy\.pacing {message}"):
-            PACINGS.find(bad)

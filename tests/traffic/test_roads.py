@@ -108,12 +108,11 @@ def test_bad_files_are_refused_by_file_and_field(road, old, new, message):
         ("estimator", '"own:Part"', ""),
         ("observation", '["default", "own:Part"]', r"\[1\]"),
         ("privacy", '{ preset = "own:Part" }', r"\.preset"),
-        ("privacy", '{ preset = "paced", pacing = "own:Part" }', r"\.pacing"),
         ("reward", '"own:Part"', ""),
     ],
 )
 def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
-    assert {*REGISTRIES} - {"corridor", "pacing", "schedule"} == {*PARTS}  # each of them is here
+    assert {*REGISTRIES} - {"corridor", "schedule"} == {*PARTS}  # each of them is here
     trace = road.parent / "trace"
     (road.parent / "own.py").write_text(f"import os\nos.mkdir({str(trace)!r})\nPart = None")
     monkeypatch.chdir(road.parent)
