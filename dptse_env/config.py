@@ -30,7 +30,7 @@ from dptse_env.release import (
     PrivacySettings,
     QueryOptions,
 )
-from dptse_env.release.queries import check_levels, check_spans
+from dptse_env.release.queries import check_spans
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.spaces.observations import BLOCKS, DEFAULT
 from dptse_env.spaces.rewards import REWARDS
@@ -95,8 +95,6 @@ class EnvConfig:
         query_spans: Numbers of neighbouring mainline segments that one query may cover, ascending.
             Several segments are released as one sum. Others than 1 need a release model that
             releases sums.
-        price_levels: Factors on the release model's price among which a query chooses. Others than
-            1 need a release model that releases sums.
         bandwidth_unit: Cost of a query: ``segments``, the number of segments that it covers, or
             ``sums``, one.
         action: The action encoding: ``mask``, ``scores``, ``slots``, ``sequential``, a registered
@@ -131,7 +129,6 @@ class EnvConfig:
     estimator_settings: Any = None
     bandwidth: Annotated[int, Interval(1, 1000)] = 5
     query_spans: tuple[Annotated[int, Interval(1, 1000)], ...] = (1,)
-    price_levels: tuple[Annotated[float, Interval(0.05, 20)], ...] = (1.0,)
     bandwidth_unit: BandwidthUnit = "segments"
     action: Any = "mask"
     observation: tuple[Any, ...] = (DEFAULT,)
@@ -165,7 +162,6 @@ class EnvConfig:
             self.corridor.n_mainline,
             self.bandwidth,
             self.query_spans,
-            self.price_levels,
             self.bandwidth_unit,
             self.has_separate_sensors,
         )
@@ -331,20 +327,16 @@ def _spans(
     spans: tuple[int, ...] = _typed(path, value, base)
     n = corridor.n_mainline
     check_spans(n, spans)
-    _check_sums(path, spans, privacy)
     if max(spans) > 1:
+        model = RELEASE_MODELS.find(privacy.preset)
+        name = RELEASE_MODELS.name_of(model)
+        plain = f"(1,) with the release model {name!r}, which releases no sums"
+        require(model.releases_sums, path, plain, spans)
         alike = "(1,) where mainline segments differ in length"
         require(len(set(corridor.segment_lengths[:n])) == 1, path, alike, spans)
-        centre = RELEASE_MODELS.find(privacy.preset).flow_centre(corridor, privacy)
+        centre = model.flow_centre(corridor, privacy)
         require(centre is not None, path, "(1,) where mean speeds are released", spans)
     return spans
-
-
-def _check_sums(path: str, value: Any, privacy: PrivacySettings) -> None:
-    model = RELEASE_MODELS.find(privacy.preset)
-    name = RELEASE_MODELS.name_of(model)
-    plain = f"(1,) with the release model {name!r}, which releases no sums"
-    require(value == (1,) or model.releases_sums, path, plain, value)
 
 
 def _bandwidth(
@@ -369,16 +361,6 @@ def _limited_bandwidth(base: int, corridor: Corridor, *_: Any) -> int:
             stacklevel=1,
         )
     return min(base, n)
-
-
-def _levels(
-    path: str, value: Any, base: Any, corridor: Corridor, privacy: Any, spans: tuple[int, ...]
-) -> tuple[float, ...]:
-    """Return price levels, which the release model must have."""
-    levels: tuple[float, ...] = _typed(path, value, base)
-    check_levels(corridor.n_mainline, spans, levels)
-    _check_sums(path, levels, privacy)
-    return levels
 
 
 def _observation(path: str, value: Any, base: Any) -> tuple[Any, ...]:
@@ -467,7 +449,6 @@ KEYWORDS = {
     "parameters": Keyword(_parameters),
     "estimator_settings": Keyword(_settings, ("estimator", "parameters", "privacy", "corridor")),
     "query_spans": Keyword(_spans, ("corridor", "privacy")),
-    "price_levels": Keyword(_levels, ("corridor", "privacy", "query_spans")),
     "bandwidth_unit": Keyword(),
     "bandwidth": Keyword(
         _bandwidth, ("corridor", "query_spans", "bandwidth_unit"), default=_limited_bandwidth

@@ -30,10 +30,10 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
 
     **Queries**: by default an option is one mainline segment, so that there are G = n options, and
     a step may query as many as the ``bandwidth``. With ``query_spans`` an option is the average
-    over one or several neighbouring segments, with ``price_levels`` one of several prices for it;
-    ``interface.queries`` is the table of all G. An option costs as much of the ``bandwidth`` as it
-    has segments, or one (``bandwidth_unit="sums"``). Options that overlap may be queried together;
-    each answer has noise of its own.
+    over one or several neighbouring segments; ``interface.queries`` is the table of all G. An
+    option costs as much of the ``bandwidth`` as it has segments, or one
+    (``bandwidth_unit="sums"``). Options that overlap may be queried together; each answer has noise
+    of its own.
 
     **Observation**: a flat float32 ``Box`` of named blocks, in this order; ``interface.observations
     .slices`` has the place of each. The scales are constants of the corridor: of densities
@@ -129,7 +129,6 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `estimator_settings` | None            | tuning of the estimator; None for what ships        |
     | `bandwidth`          | 5               | largest cost of the queries of a step               |
     | `query_spans`        | (1,)            | numbers of neighbouring segments of an option       |
-    | `price_levels`       | (1.0,)          | factors on the price of an option                   |
     | `bandwidth_unit`     | "segments"      | or `sums`: what an option costs                     |
     | `action`             | "mask"          | encoding of actions, see above                      |
     | `observation`        | ("default",)    | blocks of the observation, see above                |

@@ -149,7 +149,6 @@ NAMES = {
     "reward": [*REWARDS],
     "backend": ["compiled", "compiled", "reference"],
     "query_spans": [[1], [1, 2], [1, 2, 4], [2]],
-    "price_levels": [[1.0], [0.5, 1, 2]],
     "bandwidth_unit": ["segments", "sums"],
     "bandwidth": [1, 2, 3, 1000],
     "horizon": [1, 5, 240, 241],

@@ -353,7 +353,7 @@ class PricedRelease(SumRelease):
         queries = self.task.queries
         asked = request.observed[:, : queries.n_options]
         before = self.prices[request.episodes]
-        self.prices[request.episodes] = np.where(asked, 0.01 * queries.level, before)
+        self.prices[request.episodes] = np.where(asked, 0.01, before)
         self.tracer[request.episodes] += 0.25 * self.task.covered(request.observed)
         return super().release(request)
 

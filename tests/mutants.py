@@ -162,11 +162,6 @@ MUTANTS = (
         "centre[k, n_segments + r] = 0.5 * fastest",
         "release/test_paced.py",
     ),
-    Mutant(
-        "the price level is ignored", 3, "release/pacing.py",
-        "price *= columns.level[c] / columns.span[c]", "price /= columns.span[c]",
-        "release/test_pacing.py",
-    ),
     # --- one vehicle --------------------------------------------------------------------------
     Mutant(
         "two vehicles share a ledger", 4, "release/vehicles.py",

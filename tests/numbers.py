@@ -71,7 +71,7 @@ RELEASES: dict[str, dict[str, Any]] = {
     "capped-event": {"privacy": {"preset": "capped", "unit": "event"}},
     "capped-boundary": {"privacy": {"preset": "capped", "boundary_inputs": "private"}},
     "paced": {"privacy": "paced"},
-    "paced-spans": {"privacy": "paced", "query_spans": [1, 2], "price_levels": [0.5, 1.0]},
+    "paced-spans": {"privacy": "paced", "query_spans": [1, 2]},
     "paced-connected": {"privacy": "paced", "penetration": 0.3},
     "capped-connected": {"privacy": "capped", "penetration": 0.3},
     "paced-detectors": {"privacy": "paced", "detectors": {"absolute": 1.0}},

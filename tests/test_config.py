@@ -50,10 +50,7 @@ WHOLE = [
     {"incident": "random", "demand": "random"},
     {"privacy": PRIVACY},
     {"estimator_settings": {"process_noise": [0.5, 0.25], "ukf": {"alpha": 1.0}}},
-    {
-        "privacy": SUMS, "query_spans": [1, 2, 4], "price_levels": [0.5, 1, 2],
-        "bandwidth_unit": "sums",
-    },
+    {"privacy": SUMS, "query_spans": [1, 2, 4], "bandwidth_unit": "sums"},
 ]  # fmt: skip
 
 
@@ -228,19 +225,14 @@ BAD_QUERIES = [
     ({"query_spans": [0, 1]}, r"query_spans\[0\] must be"),
     ({"query_spans": [1.5]}, r"query_spans\[0\] must be"),
     ({"query_spans": 2}, "query_spans must be"),
-    ({"price_levels": []}, "price_levels must be"),
-    ({"price_levels": [1, 2, 1.0]}, "price_levels must be"),
-    ({"price_levels": [0.01]}, r"price_levels\[0\] must be"),
-    ({"price_levels": [1, 21]}, r"price_levels\[1\] must be"),
     ({"bandwidth_unit": "queries"}, "bandwidth_unit must be"),
     ({"query_spans": [3, 4]}, r"bandwidth must be in 3\.\.6"),
     ({"bandwidth": 7}, r"bandwidth must be in 1\.\.6"),
-    (LONG_ROAD, rf"query_spans and price_levels must leave at most {MOST_OPTIONS} .*, got 15050$"),
+    (LONG_ROAD, rf"query_spans must leave at most {MOST_OPTIONS} .*, got 15050$"),
     ({"privacy": MeanRelease, "query_spans": (1, 2)}, r"query_spans must be \(1,\) where mean"),
     *[
-        ({"privacy": preset, key: [1, 2]}, rf"{key} must be \(1,\) .* model '{preset}'")
+        ({"privacy": preset, "query_spans": [1, 2]}, rf"query_spans must be .* model '{preset}'")
         for preset in ("paper", "corrected", "capped")
-        for key in ("query_spans", "price_levels")
     ],
 ]
 
@@ -252,9 +244,7 @@ def test_bad_queries_are_named():
 
 
 def test_models_of_single_segments_take_what_says_so():
-    assert resolve("short-highway", {"privacy": "capped", "query_spans": [1]}).queries.are_plain
-    levels = {"privacy": MeanRelease, "price_levels": (1.0, 2.0)}
-    assert resolve("short-highway", levels).queries.n_options == 12
+    assert resolve("short-highway", {"privacy": "capped", "query_spans": [1]}).queries.are_segments
 
 
 def test_the_hint_on_an_unknown_keyword_imports_no_plugin(monkeypatch):

@@ -234,7 +234,6 @@ def configuration(one_of):
         )
         options = {
             "query_spans": one_of((1,), (2,), (1, 2), (1, 2, 3)[:span]),
-            "price_levels": one_of((1.0,), (0.5, 4.0)),
         }
     else:
         unit, cap = one_of(("trip", 7), ("trip", 1), ("trip", HORIZON), ("event", 1))
@@ -399,7 +398,7 @@ class PacedAtOnce(Paced):
 
 EXIT, FAST_ONE, NOBODY = ROAD.n_segments + 1, (1, 150.0), (AWAY, 0.0)
 BOTH_SEE = {"penetration": Known(share=0.5), "detectors": Detectors(budget_share=0.6)}
-OVERLAPPING = {"query_spans": (1, 2), "price_levels": (0.5, 4.0)}
+OVERLAPPING = {"query_spans": (1, 2)}
 WORST = {
     "capped": (CappedSettings(cap=7, share=0.2), {}, (1, 0.0), FAST_ONE),
     "capped, a second, by queries and sensors": (

@@ -1,4 +1,4 @@
-"""Whole environments in which a query may cover several segments, at several price levels."""
+"""Whole environments in which a query may cover several segments."""
 
 import itertools
 
@@ -24,15 +24,15 @@ ONE = np.zeros(1, dtype=np.int64)
 CONFIGURATIONS = {
     "spans": {"query_spans": (1, 2, 4), "bandwidth": 5},
     "sums": {"query_spans": (2, 3), "bandwidth_unit": "sums"},
-    "levels": {"price_levels": (0.5, 2.0)},
+    "segments": {},
     "all of it": {
-        "query_spans": (2, 3), "price_levels": (1.0, 4.0), "bandwidth": 4,
+        "query_spans": (2, 3), "bandwidth": 4,
         "privacy": {"preset": PricedRelease, "boundary_inputs": "private"},
     },
     "one query": {"query_spans": (6,), "bandwidth_unit": "sums"},
 }  # fmt: skip
 PAIRS = [
-    ("spans", "sequential"), ("sums", "mask"), ("levels", "slots"), ("all of it", "scores"),
+    ("spans", "sequential"), ("sums", "mask"), ("segments", "slots"), ("all of it", "scores"),
     ("all of it", "sequential"), ("one query", "slots"),
 ]  # fmt: skip
 
@@ -131,8 +131,8 @@ def test_queries_bring_the_estimate_nearer(estimator, spans):
 
 
 def test_blocks_have_the_size_of_options_and_show_prices_and_the_tracer():
-    process = make_process(query_spans=(2, 3), price_levels=(1.0, 4.0))
-    encoding, n_options = process.interface.observations, 18
+    process = make_process(query_spans=(2, 3))
+    encoding, n_options = process.interface.observations, 9
     assert process.interface.actions.space == gym.spaces.MultiBinary(n_options)
     sizes = {name: place.stop - place.start for name, place in encoding.slices.items()}
     of_options = ("released_density", "released_flow", "density_innovation", "queried")
@@ -145,8 +145,10 @@ def test_blocks_have_the_size_of_options_and_show_prices_and_the_tracer():
     observation = query(process, 6)
     prices = encoding.block(observation, "last_price")[0]
     assert np.flatnonzero(prices).tolist() == [1, 6]
-    np.testing.assert_allclose(prices[[1, 6]], 0.5 * np.log10([0.01, 0.04]), rtol=1e-6)
-    np.testing.assert_allclose(encoding.block(observation, "tracer")[0], [0, 0.5, 0.5, 0, 0, 0.5])
+    np.testing.assert_allclose(prices[[1, 6]], 0.5 * np.log10(0.01), rtol=1e-6)
+    np.testing.assert_allclose(
+        encoding.block(observation, "tracer")[0], [0, 0.5, 0.5, 0.25, 0, 0.5]
+    )
 
 
 def test_blocks_of_prices_are_there_where_queries_have_prices_or_they_are_asked_for():

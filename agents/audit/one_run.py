@@ -148,9 +148,9 @@ def make_design(config: EnvConfig, slot: int, kind: str) -> Design:
 
 
 def apart(task: Task) -> IntArray:
-    """Return query options that share no segment; the cheapest come first, and the least noise."""
+    """Return query options that share no segment; the cheapest come first."""
     taken, sites = np.zeros(task.n_places, dtype=bool), []
-    for option in np.lexsort((-task.queries.level, task.queries.cost)).tolist():
+    for option in np.argsort(task.queries.cost, kind="stable").tolist():
         covered = task.covers[option]
         if not (covered & taken).any():
             taken |= covered

@@ -87,8 +87,7 @@ class Planner:
         self._is_whole = self._release.task.is_whole
         self._queries = queries = self._release.task.queries
         # The option to ask for each segment, shape (n_mainline,): the cheapest.
-        costs = np.where(queries.level == queries.standard_level, queries.cost, math.inf)
-        self._option = np.argmin(np.where(queries.covers.T, costs, math.inf), axis=1)
+        self._option = np.argmin(np.where(queries.covers.T, queries.cost, math.inf), axis=1)
         ledgers = getattr(self._release, "ledgers", None)
         self._clip = getattr(ledgers, "clip", math.inf)
         self._fastest = float(getattr(ledgers, "fastest", math.inf))

@@ -354,7 +354,7 @@ class ReleaseModel(ABC):
     claims_guarantee: ClassVar[bool] = False
     """True where users expect a guarantee, so that a warning is due if it is void."""
     releases_sums: ClassVar[bool] = False
-    """True where a release may cover several segments, at a price level that the query chooses."""
+    """True where a release may cover several segments."""
     needs_vehicles: ClassVar[bool] = False
     """True where the model reads the vehicles of a record, which measured fields have not."""
     has_prices: ClassVar[bool] = False

@@ -85,14 +85,11 @@ class PacedColumns(NamedTuple):
     first: IntArray  # (C,) first place of each
     span: IntArray  # (C,) number of places that each covers
     group: IntArray  # (C,) its group
-    level: FloatArray  # (C,) price level
 
     @classmethod
     def make(cls, task: Task) -> PacedColumns:
-        """Return the columns of a task; only options have price levels."""
-        level = np.ones(task.n_columns)
-        level[: task.queries.n_options] = task.queries.level
-        return cls(task.first, task.span, task.group, level)
+        """Return the columns of a task."""
+        return cls(task.first, task.span, task.group)
 
 
 class Pacing(ABC):
@@ -147,7 +144,7 @@ class TripPacing(Pacing):
     of a trip has R queried seconds: the sum, over the segments from here on, of the rate of
     querying times the length over the predicted speed, which is held to [8, 102] km/h, and a margin
     of 2 s. The price on a segment is ``max(pace b - m, 0.01 b) / R``, and that of a query the mean
-    over its segments, times its level.
+    over its segments.
 
     Rates of querying are averages over the last minute or so. They begin at equal rates for all
     segments, so that a policy that keeps querying the same place is soon paced for that.
@@ -278,7 +275,7 @@ def _pace(
                 price = 0.0
                 for s in range(first, last):
                     price += max(offered[g] - paid[s], least[g]) / rest[s]
-                price *= columns.level[c] / columns.span[c]
+                price /= columns.span[c]
                 prices[k, c] = price
                 if observed[k, c]:
                     for s in range(first, last):
@@ -363,7 +360,7 @@ def _seconds(length: float, speed: float) -> float:
 def _divide(
     bundle: Bundle, n_places: int, observed: BoolArray, whole: FloatArray, prices: FloatArray
 ) -> None:
-    """Divide a second's budgets among a group's queries that cover a place, by their levels."""
+    """Divide a second's budgets alike among a group's queries that cover a place."""
     (columns,) = bundle.parts
     total = np.empty((whole.size, n_places))
     for k in range(observed.shape[0]):
@@ -371,10 +368,10 @@ def _divide(
         for c in range(columns.first.size):
             if observed[k, c]:
                 for s in range(columns.first[c], columns.first[c] + columns.span[c]):
-                    total[columns.group[c], s] += columns.level[c]
+                    total[columns.group[c], s] += 1.0
         for c in range(columns.first.size):
-            most, g = columns.level[c], columns.group[c]
+            most, g = 1.0, columns.group[c]
             for s in range(columns.first[c], columns.first[c] + columns.span[c]):
-                own = 0.0 if observed[k, c] else columns.level[c]
+                own = 0.0 if observed[k, c] else 1.0
                 most = max(most, total[g, s] + own)
-            prices[k, c] = whole[g] * columns.level[c] / most
+            prices[k, c] = whole[g] / most

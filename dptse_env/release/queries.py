@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +12,7 @@ import numpy as np
 from dptse_env.model import MeasurementRows
 from dptse_env.model.network import covered
 from dptse_env.traffic import Corridor
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import BoolArray, IntArray
 
 BandwidthUnit = Literal["segments", "sums"]
 """Cost of a query in the bandwidth: as much as it has segments, or one."""
@@ -27,13 +26,12 @@ MOST_OPTIONS = 10_000
 class QueryOptions:
     """The G queries among which a policy chooses, each of neighbouring mainline segments.
 
-    Options are in the order of their spans, within these of their price levels, within these from
-    upstream to downstream. By default option s is segment s.
+    Options are in the order of their spans, within these from upstream to downstream. By default
+    option s is segment s.
 
     Attributes:
         first: The first segment of each option, shape (G,).
         span: Number of segments that each covers, shape (G,).
-        level: Factor on the release model's price, shape (G,).
         cost: What each costs of the bandwidth, shape (G,).
         n_mainline: Mainline segments n.
         bandwidth: Largest total cost of the queries of a step.
@@ -43,7 +41,6 @@ class QueryOptions:
 
     first: IntArray
     span: IntArray
-    level: FloatArray
     cost: IntArray
     n_mainline: int
     bandwidth: int
@@ -55,27 +52,23 @@ class QueryOptions:
         n_mainline: int,
         bandwidth: int,
         spans: Sequence[int] = (1,),
-        levels: Sequence[float] = (1.0,),
         unit: BandwidthUnit = "segments",
         separate_sensors: bool = False,
     ) -> QueryOptions:
-        """Return all options of some spans and price levels.
+        """Return all options of some spans.
 
         Args:
             n_mainline: Mainline segments.
             bandwidth: Largest total cost of the queries of a step.
             spans: The keyword ``query_spans``.
-            levels: The keyword ``price_levels``.
             unit: The keyword ``bandwidth_unit``.
             separate_sensors: See the attribute.
         """
-        groups = [(span, level) for span in spans for level in levels]
-        sizes = [n_mainline - span + 1 for span, _ in groups]
-        span = np.repeat(np.array([span for span, _ in groups], dtype=np.int64), sizes)
+        sizes = [n_mainline - span + 1 for span in spans]
+        span = np.repeat(np.array(spans, dtype=np.int64), sizes)
         return cls(
             first=np.concatenate([np.arange(size) for size in sizes]),
             span=span,
-            level=np.repeat(np.array([level for _, level in groups], dtype=np.float64), sizes),
             cost=span if unit == "segments" else np.ones_like(span),
             n_mainline=n_mainline,
             bandwidth=bandwidth,
@@ -83,9 +76,8 @@ class QueryOptions:
         )
 
     def __str__(self) -> str:
-        """Return the spans and price levels in words."""
-        spans, levels = (dict.fromkeys(part.tolist()) for part in (self.span, self.level))
-        return f"query_spans {tuple(spans)} and price_levels {tuple(levels)}"
+        """Return the spans in words."""
+        return f"query_spans {tuple(dict.fromkeys(self.span.tolist()))}"
 
     @property
     def n_options(self) -> int:
@@ -109,19 +101,8 @@ class QueryOptions:
 
     @cached_property
     def are_segments(self) -> bool:
-        """True if option s is segment s, at whatever price level."""
-        return self.n_options == self.n_mainline and bool((self.span == 1).all())
-
-    @cached_property
-    def are_plain(self) -> bool:
-        """True if option s is segment s, at the release model's price."""
-        return self.are_segments and bool((self.level == 1.0).all())
-
-    @cached_property
-    def standard_level(self) -> float:
-        """The price level nearest to 1 by ratio, the lower one of two."""
-        levels: list[float] = self.level.tolist()
-        return min(levels, key=lambda level: (abs(math.log(level)), level))
+        """True if option s is segment s."""
+        return bool((self.span == 1).all())
 
     def covered(self, queried: BoolArray) -> BoolArray:
         """Return the segments (k, n_mainline) that queried options (k, G) cover."""
@@ -130,8 +111,8 @@ class QueryOptions:
     def rows(self, corridor: Corridor) -> MeasurementRows:
         """Return the rows of a release: options, then ramps, then sensors without an option.
 
-        The last are mainline segments with a fixed sensor: those that are no option of span 1 and
-        price level 1, or all where sensors are separate.
+        The last are mainline segments with a fixed sensor: those that are no option of span 1, or
+        all where sensors are separate.
         """
         others = np.array(self._others(corridor), dtype=np.int64)
         return MeasurementRows(
@@ -155,26 +136,23 @@ class QueryOptions:
 
     @cached_property
     def _singles(self) -> dict[int, int]:
-        """The options of span 1 and price level 1, by their segment."""
-        single = np.flatnonzero((self.span == 1) & (self.level == 1.0))
+        """The options of span 1, by their segment."""
+        single = np.flatnonzero(self.span == 1)
         return {int(self.first[option]): int(option) for option in single}
 
 
 def check_spans(n: int, spans: Sequence[int]) -> None:
-    """Raise ``ValueError`` unless `spans` are ascending numbers of the n mainline segments."""
+    """Refuse spans that are not ascending numbers of the n mainline segments, or too many.
+
+    Raises:
+        ValueError: See above; too many are those that leave more than `MOST_OPTIONS`.
+    """
     if not spans or list(spans) != sorted(set(spans)) or not 1 <= spans[0] <= spans[-1] <= n:
         raise ValueError(
             f"query_spans must be ascending, distinct numbers of segments in 1..{n}, got {spans}"
         )
-
-
-def check_levels(n: int, spans: Sequence[int], levels: Sequence[float]) -> None:
-    """Raise ``ValueError`` unless `levels` are distinct and leave at most `MOST_OPTIONS`."""
-    if not levels or len(set(levels)) < len(levels):
-        raise ValueError(f"price_levels must be distinct factors, got {levels}")
-    n_options = len(levels) * sum(n - span + 1 for span in spans)
+    n_options = sum(n - span + 1 for span in spans)
     if n_options > MOST_OPTIONS:
         raise ValueError(
-            f"query_spans and price_levels must leave at most {MOST_OPTIONS} queries to choose "
-            f"from, got {n_options}"
+            f"query_spans must leave at most {MOST_OPTIONS} queries to choose from, got {n_options}"
         )

@@ -101,12 +101,12 @@ class RoadChannels:
         """Return the channels of the observations of an environment of ``config``.
 
         Raises:
-            ValueError: Queries are not of single segments at one price level.
+            ValueError: Queries are not of single segments.
         """
         if not config.queries.are_segments:
             raise ValueError(
-                "a policy whose network is shared by all segments needs query_spans (1,) and one "
-                f"price level, got {config.queries}"
+                "a policy whose network is shared by all segments needs query_spans (1,), got "
+                f"{config.queries}"
             )
         corridor, n = config.corridor, config.corridor.n_mainline
         encoding = make_interface(config).observations

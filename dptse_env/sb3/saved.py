@@ -230,7 +230,7 @@ def _fit(config: EnvConfig, name: str) -> dict[str, Any]:
         "corridor": config.corridor.digest,
         "bandwidth": config.bandwidth,
     }
-    if not config.queries.are_plain:
+    if not config.queries.are_segments:
         fit["queries"] = f"{config.queries}, bandwidth_unit {config.bandwidth_unit!r}"
     if name == SHARED:
         fit["channels"] = [channel.name for channel in RoadChannels.from_config(config).channels]

@@ -97,7 +97,7 @@ class ScheduleState(NamedTuple):
 class Schedule(ABC):
     """A query policy that needs no training; subclasses choose options in `select`.
 
-    Options are the mainline segments, unless the environment has other spans or price levels
+    Options are the mainline segments, unless the environment has other spans
     (`dptse_env.release.QueryOptions`).
 
     Attributes:
@@ -220,15 +220,15 @@ class Schedule(ABC):
 
 
 def require_plain(interface: QueryInterface, name: str) -> None:
-    """Refuse options other than the mainline segments at the release model's price.
+    """Refuse options other than the mainline segments.
 
     Raises:
         ValueError: There are others; ``name`` is the schedule's.
     """
-    if not interface.queries.are_plain:
+    if not interface.queries.are_segments:
         raise ValueError(
-            f"schedule {name!r} queries single segments: it needs query_spans (1,) and "
-            f"price_levels (1.0,), got {interface.queries}"
+            f"schedule {name!r} queries single segments: it needs query_spans (1,), got "
+            f"{interface.queries}"
         )
 
 
@@ -270,8 +270,8 @@ def best_options(
 ) -> BoolArray:
     """Return the options of the highest `option_values` that the bandwidth pays for, shape (k, G).
 
-    They do not overlap, and have the price level nearest to 1. Where bandwidth is left that pays
-    for no such option, it is used for others. Ties rotate along the road with the step.
+    They do not overlap. Where bandwidth is left that pays for no such option, it is used for
+    others. Ties rotate along the road with the step.
 
     Args:
         queries: The G options.
@@ -281,8 +281,7 @@ def best_options(
     """
     score = option_values(queries, value, fixed)
     turn = (queries.first - step[:, None]) % queries.n_mainline
-    other = queries.level != queries.standard_level
-    order = np.lexsort((turn, -score, np.broadcast_to(other, score.shape)), axis=1)
+    order = np.lexsort((turn, -score), axis=1)
     chosen, every = np.zeros(score.shape, dtype=bool), np.arange(len(score))
     left = np.full(len(score), queries.bandwidth)
     covered = np.zeros((len(score), queries.n_mainline), dtype=bool)
@@ -292,7 +291,7 @@ def best_options(
                 return chosen
             fits = (queries.cost[option] <= left) & ~chosen[every, option]
             if is_distinct:
-                fits &= ~other[option] & ~(covered & queries.covers[option]).any(axis=1)
+                fits &= ~(covered & queries.covers[option]).any(axis=1)
             chosen[every, option] |= fits
             covered |= queries.covers[option] & fits[:, None]
             left -= np.where(fits, queries.cost[option], 0)

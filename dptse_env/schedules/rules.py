@@ -34,7 +34,7 @@ class Everything(Schedule):
         """
         super().__init__(interface, seed)
         queries = self.queries
-        self._all = (queries.span == 1) & (queries.level == queries.standard_level)
+        self._all = queries.span == 1
         if not self._all.any():
             raise ValueError(f"schedule 'all' needs query_spans with 1, got {queries}")
         if self.bandwidth < self.n_mainline:
@@ -54,8 +54,8 @@ class Shifting(Schedule):
     The set starts at floor(n i / B) for i = 0 .. B-1; segments beyond the downstream end continue
     upstream.
 
-    Among several spans and price levels it keeps to the smallest span and the level nearest to 1:
-    n is the number of these options, and B how many of them the bandwidth pays for.
+    Among several spans it keeps to the smallest one: n is the number of its options, and B how many
+    of them the bandwidth pays for.
     """
 
     period: ClassVar[int]
@@ -64,7 +64,7 @@ class Shifting(Schedule):
         """Bind the schedule."""
         super().__init__(interface, seed)
         queries = self.queries
-        own = (queries.span == queries.span.min()) & (queries.level == queries.standard_level)
+        own = queries.span == queries.span.min()
         self._options = np.flatnonzero(own)
         n = self._options.size
         size = min(self.bandwidth // int(queries.cost[own][0]), n)

@@ -2,7 +2,7 @@
 
 Every encoding turns a batch of actions into queries that the bandwidth pays for, and turns a set of
 queries back into an action. What can be queried are options: the mainline segments, or, with other
-spans and price levels, those of `dptse_env.release.QueryOptions`. An encoding holds its Gymnasium
+spans, those of `dptse_env.release.QueryOptions`. An encoding holds its Gymnasium
 space, so the two cannot drift apart, and no state: the state between actions is part of the process
 (`PendingPicks`). Surplus requests are dropped, and missing ones added, from a rotating pointer that
 does not depend on the traffic.
@@ -129,7 +129,7 @@ class Decision(NamedTuple):
 class ActionEncoding(ABC):
     """Base class of the encodings.
 
-    An option is a mainline segment, unless the environment has other spans or price levels
+    An option is a mainline segment, unless the environment has other spans
     (`dptse_env.release.QueryOptions`).
 
     Attributes:

@@ -23,14 +23,12 @@ TWO = Group("queries", 0.75), Group("sensors", 0.25)
 
 
 def make(
-    kind=TripPacing, *, road=SHORT_HIGHWAY, bandwidth=3, spans=(1,), levels=(1.0,), sensors=(),
+    kind=TripPacing, *, road=SHORT_HIGHWAY, bandwidth=3, spans=(1,), sensors=(),
     boundary="nominal", n_episodes=1, groups=WHOLE,
 ):  # fmt: skip
     """A pacing of half the road a second, unless another bandwidth is given."""
     road = dataclasses.replace(road, fixed_sensors=sensors)
-    queries = QueryOptions.make(
-        road.n_mainline, bandwidth, spans, levels, separate_sensors=len(groups) > 1
-    )
+    queries = QueryOptions.make(road.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1)
     settings = PacedSettings(pace=PACE, ratio=RATIO, boundary_inputs=boundary)
     task = Task("paced", Paced, settings, road, queries, 240, n_episodes, groups)
     pacing = kind(task, BUDGET * task.shares)
@@ -77,13 +75,12 @@ class PlainTracer:
     def prices(self, observed, density, speed):
         """Prices of the group's columns."""
         self.tracer = self.carried(density, speed)
-        rest, level = self.remaining(speed), np.ones(self.task.n_columns)
-        level[: self.task.queries.n_options] = self.task.queries.level
+        rest = self.remaining(speed)
         left = np.maximum(PACE * self.budget - self.tracer, 0.01 * self.budget)
         prices, seen = {}, np.zeros_like(self.tracer)
         for c in self.columns:
             covered = slice(self.task.first[c], self.task.first[c] + self.task.span[c])
-            prices[c] = level[c] * (left[covered] / rest[covered]).mean()
+            prices[c] = (left[covered] / rest[covered]).mean()
             if observed[c]:
                 seen[covered] += prices[c]
         self.tracer = self.tracer + SHARE * seen
@@ -135,7 +132,7 @@ class PlainTracer:
 
 ROADS = {
     "plain": {},
-    "sums": {"spans": (1, 2, 3), "levels": (0.5, 1.0, 2.0), "sensors": (5, 2)},
+    "sums": {"spans": (1, 2, 3), "sensors": (5, 2)},
     "boundaries": {"sensors": (7,), "boundary": "private", "bandwidth": 1},
     "groups": {"sensors": (5, 7), "boundary": "private", "groups": TWO},
     "uneven": {"road": UNEVEN, "boundary": "private"},
@@ -210,7 +207,7 @@ def test_episodes_do_not_meet_and_a_reset_begins_anew():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_second_s_budget_covers_all_queries_of_a_segment(seed):
-    pacing = make(EventPacing, spans=(1, 2, 3), levels=(0.2, 1.0, 3.0))
+    pacing = make(EventPacing, spans=(1, 2, 3))
     observed = np.random.default_rng(seed).random(pacing.task.n_columns) < 0.3
     prices = prices_of(pacing, observed)[0]
     whole = BUDGET / (1.0 + RATIO)

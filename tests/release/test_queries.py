@@ -15,16 +15,15 @@ def flags(n, *places):
     return np.isin(np.arange(n), places)[None]
 
 
-def test_options_are_in_order_of_span_level_and_place():
-    options = QueryOptions.make(4, 4, (1, 3), (2.0, 0.5))
-    assert options.first.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 0, 1]
-    assert options.span.tolist() == [1] * 8 + [3] * 4
-    assert options.level.tolist() == [2.0] * 4 + [0.5] * 4 + [2.0] * 2 + [0.5] * 2
-    assert options.cost.tolist() == [1] * 8 + [3] * 4
-    assert options.covers.shape == (options.n_options, 4) == (12, 4)
-    assert np.flatnonzero(options.covers[9]).tolist() == [1, 2, 3]
-    assert np.flatnonzero(options.covered(flags(12, 0, 9))).tolist() == [0, 1, 2, 3]
-    assert str(options) == "query_spans (1, 3) and price_levels (2.0, 0.5)"
+def test_options_are_in_order_of_span_and_place():
+    options = QueryOptions.make(4, 4, (1, 3))
+    assert options.first.tolist() == [0, 1, 2, 3, 0, 1]
+    assert options.span.tolist() == [1] * 4 + [3] * 2
+    assert options.cost.tolist() == [1] * 4 + [3] * 2
+    assert options.covers.shape == (options.n_options, 4) == (6, 4)
+    assert np.flatnonzero(options.covers[5]).tolist() == [1, 2, 3]
+    assert np.flatnonzero(options.covered(flags(6, 0, 5))).tolist() == [0, 1, 2, 3]
+    assert str(options) == "query_spans (1, 3)"
 
 
 @pytest.mark.parametrize(
@@ -44,37 +43,26 @@ def test_the_bandwidth_pays_for_so_many_queries(bandwidth, spans, unit, most):
     assert options.costs_differ == (unit == "segments" and len(spans) > 1)
 
 
-@pytest.mark.parametrize(
-    ("levels", "standard"),
-    [((1.0,), 1.0), ((0.25, 3.0), 3.0), ((2.0, 0.5), 0.5), ((5.0, 0.9), 0.9)],
-)
-def test_the_standard_level_is_nearest_to_one(levels, standard):
-    assert QueryOptions.make(4, 4, levels=levels).standard_level == standard
-
-
 def test_plain_options_are_the_segments():
     options, queried = QueryOptions.make(6, 3), flags(6, 1, 4)
-    assert options.are_plain
+    assert options.are_segments
     assert options.rows(ROAD).are_single
     assert options.sensor_rows(ROAD) == ROAD.fixed_sensors
     np.testing.assert_array_equal(options.covered(queried), queried)
     assert not np.shares_memory(options.covered(queried), queried)
-    for changed in ({"levels": (2.0,)}, {"spans": (2,)}, {"levels": (1.0, 2.0)}):
-        assert not QueryOptions.make(6, 3, **changed).are_plain
+    assert not any(QueryOptions.make(6, 3, spans).are_segments for spans in ((2,), (1, 2)))
 
 
 @pytest.mark.parametrize(
-    ("spans", "levels", "separate", "sensors"),
+    ("spans", "separate", "sensors"),
     [
-        ((2,), (1.0,), False, [7, 6, 8]),
-        ((1, 2), (0.5, 1.0), False, [11, 23, 8]),  # options of span and level one
-        ((1, 2), (1.0,), True, [13, 12, 14]),
+        ((2,), False, [7, 6, 8]),
+        ((1, 2), False, [5, 12, 2]),  # options of span one
+        ((1, 2), True, [13, 12, 14]),
     ],
 )
-def test_rows_are_options_then_ramps_then_sensors_without_an_option(
-    spans, levels, separate, sensors
-):
-    options = QueryOptions.make(6, 4, spans, levels, separate_sensors=separate)
+def test_rows_are_options_then_ramps_then_sensors_without_an_option(spans, separate, sensors):
+    options = QueryOptions.make(6, 4, spans, separate_sensors=separate)
     rows, found, n = options.rows(ROAD), list(options.sensor_rows(ROAD)), options.n_options
     assert found == sensors
     assert rows.first[found].tolist() == [5, 7, 2]

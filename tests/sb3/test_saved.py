@@ -256,7 +256,7 @@ def test_a_perceptron_queries_several_segments_at_once(path, action):
         assert info["queried"] @ env.unwrapped.config.queries.cost <= 3
         assert action != "sequential" or info["n_dropped"] == 0
     other = make_env(action=action, **SPANS, bandwidth_unit="sums")
-    with pytest.raises(ValueError, match=r"queries is \"query_spans \(1, 2\) and price_levels"):
+    with pytest.raises(ValueError, match=r"queries is \"query_spans \(1, 2\), bandwidth_unit"):
         load_policy(path, other, allow=("corridor", "bandwidth"))
 
 

@@ -53,13 +53,12 @@ def test_shifting_sets_start_far_apart_and_move_downstream():
     assert sets[60] == sets[12] == sets[0]
 
 
-def test_a_shifting_set_keeps_to_one_span_and_level():
-    env = Bare(query_spans=(2, 3), price_levels=(0.5, 1.0), bandwidth=6, privacy=SumRelease)
+def test_a_shifting_set_keeps_to_one_span():
+    env = Bare(query_spans=(2, 3), bandwidth=6, privacy=SumRelease)
     size = env.interface.observations.space.shape[0]
     steps = np.arange(14)
     asked = make_schedule("round-robin", env).select(steps, np.zeros((14, size), np.float32))
     assert (env.queries.span[np.nonzero(asked)[1]] == 2).all()
-    assert (env.queries.level[np.nonzero(asked)[1]] == 1.0).all()
     first = [env.queries.first[row].tolist() for row in asked]
     assert (first[0], first[1], first[5]) == ([0, 4, 9], [1, 5, 10], [0, 5, 9])
     assert (asked.sum(axis=0)[asked.any(axis=0)] == 3).all()  # each of them equally often
@@ -76,10 +75,10 @@ def test_random_draws_different_sets_of_full_size():
 def test_none_and_all():
     assert queried("none", 1) == [[]]
     assert queried("all", 1, bandwidth=15) == [list(range(15))]
-    spans = {"query_spans": (1, 2), "price_levels": (0.5, 1.0), "privacy": SumRelease}
+    spans = {"query_spans": (1, 2), "privacy": SumRelease}
     (asked,), options = queried("all", 1, bandwidth=15, **spans), Bare(**spans).queries
     assert sorted(options.first[asked]) == list(range(15))
-    assert set(zip(options.span[asked], options.level[asked], strict=True)) == {(1, 1.0)}
+    assert set(options.span[asked]) == {1}
     with pytest.raises(ValueError, match="'all' needs bandwidth 15, the environment has 5"):
         queried("all", 1)
     with pytest.raises(ValueError, match=r"'all' needs query_spans with 1, got query_spa"):
@@ -207,19 +206,13 @@ def test_an_option_is_worth_the_mean_of_its_segments_for_its_cost():
 @pytest.mark.parametrize(
     ("options", "value", "expected"),
     [
-        (QueryOptions.make(6, 2, (3,), unit="sums"), [1, 1, 1, 1, 1, 0.5], [(0, 1), (3, 1)]),
+        (QueryOptions.make(6, 2, (3,), unit="sums"), [1, 1, 1, 1, 1, 0.5], [0, 3]),
         # None is left apart from the best.
-        (QueryOptions.make(6, 2, (3,), unit="sums"), [0, 1, 1, 1, 0, 0], [(0, 1), (1, 1)]),
-        (QueryOptions.make(6, 3, (1, 2)), [0, 0, 1, 5, 5, 0], [(2, 1), (3, 1), (4, 1)]),
-        # What is left goes to overlapping options, then to other levels.
-        (
-            QueryOptions.make(4, 4, (2,), (4.0, 1.0), unit="sums"),
-            [0, 1, 1, 2], [(2, 4), (0, 1), (1, 1), (2, 1)],
-        ),
+        (QueryOptions.make(6, 2, (3,), unit="sums"), [0, 1, 1, 1, 0, 0], [0, 1]),
+        (QueryOptions.make(6, 3, (1, 2)), [0, 0, 1, 5, 5, 0], [2, 3, 4]),
     ],
-)  # fmt: skip
+)
 def test_the_best_options_are_apart_while_there_are_such(options, value, expected):
     none, step = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
     (best,) = best_options(options, np.array([value], dtype=float), none, step)
-    taken = np.flatnonzero(best)
-    assert list(zip(options.first[taken], options.level[taken], strict=True)) == expected
+    assert options.first[best].tolist() == expected

@@ -30,10 +30,6 @@ ROADS = {
         "query_spans": (1, 2, 3), "bandwidth": 2, "bandwidth_unit": "sums", "privacy": SumRelease,
     },
     "only sums": {"query_spans": (2,), "bandwidth": 5, "privacy": SumRelease},
-    "levels": {"price_levels": (2.0, 0.9, 0.5), "bandwidth": 3, "privacy": SumRelease},
-    "both": {
-        "query_spans": (2, 3), "price_levels": (0.5, 1.0), "bandwidth": 5, "privacy": SumRelease,
-    },
 }  # fmt: skip
 CASES = [
     (name, road)
@@ -41,7 +37,7 @@ CASES = [
     if road == "segments" or name not in OF_SEGMENTS
 ]
 FAST = [
-    ("round-robin", "both"), ("oldest-first", "sums"), ("speed-front", "levels"),
+    ("round-robin", "only sums"), ("oldest-first", "sums"), ("speed-front", "spans"),
     ("expected-reduction", "spans"), ("greedy-trace", "segments"), ("oracle-gain", "segments"),
 ]  # fmt: skip
 """One for each way to choose: by the clock, by observations, by a memory, and by the process."""
@@ -95,13 +91,10 @@ def test_a_schedule_begins_anew_with_the_episode_and_may_be_asked_twice(name, ro
 
 
 @pytest.mark.parametrize("name", ["oldest-first", "expected-reduction", "oracle-error"])
-def test_sums_do_not_overlap_and_have_the_standard_level(name):
+def test_sums_do_not_overlap(name):
     options = make_single(**ROADS["spans"]).unwrapped.config.queries
     queries, _ = play(make_batch(**ROADS["spans"]), name, 8)
     assert (queries.astype(int) @ options.covers <= 1).all()
-    levels = make_single(**ROADS["levels"]).unwrapped.config.queries.level
-    queries, _ = play(make_batch(**ROADS["levels"]), name, 4)
-    assert (levels[np.nonzero(queries)[2]] == 0.9).all()
 
 
 LAST = ["oldest-first", "speed-front", "greedy-trace", "oracle-error"]
@@ -200,7 +193,7 @@ def test_a_schedule_that_does_not_suit_is_refused():
         assert isinstance(schedule, ProcessSchedule)
         with pytest.raises(ValueError, match=rf"'{name}' follows the 3 episodes"):
             schedule.predict(observation[:2])
-    for name, road in itertools.product(OF_SEGMENTS, ["spans", "levels"]):
+    for name, road in itertools.product(OF_SEGMENTS, ["spans", "only sums"]):
         with pytest.raises(ValueError, match=rf"schedule '{name}' queries single segments"):
             make_schedule(name, make_single(**ROADS[road]))
     with pytest.raises(ValueError, match=r"'greedy-trace' needs .* covariance"):

@@ -14,7 +14,7 @@ from tests.agents.elsewhere import Elsewhere
 
 from .small import HalfTheLimit, config, paced
 
-SPANS = dataclasses.replace(paced("ekf", bandwidth=4), query_spans=(1, 2), price_levels=(1.0, 2.0))
+SPANS = dataclasses.replace(paced("ekf", bandwidth=4), query_spans=(1, 2))
 
 
 class RatioOfTwo(Paced):
