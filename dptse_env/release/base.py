@@ -260,15 +260,6 @@ class Task:
         """Mainline segments in each row, shape (M, n_mainline): products of floats are faster."""
         return self.covers[: self.n_rows, : self.corridor.n_mainline].astype(np.float32)
 
-    def at_places(self, values: FloatArray) -> FloatArray:
-        """Return predictions of the segments, shape (k, S), at all places, shape (k, S + R).
-
-        That of a boundary segment is the prediction of the road's segment next to it.
-        """
-        if self.n_places == values.shape[1]:
-            return values
-        return np.concatenate([values, values[:, self.corridor.boundary_neighbours]], axis=1)
-
     # Groups -------------------------------------------------------------------------------------
 
     @cached_property

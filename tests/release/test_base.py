@@ -52,13 +52,6 @@ def test_lengths_and_limits_are_those_of_what_a_column_covers():
     np.testing.assert_array_equal(uneven.limit, every(UNEVEN.speed_limits))
 
 
-def test_predictions_of_boundary_segments_are_those_beside_them():
-    private, values = task("private"), np.arange(16.0).reshape(2, 8)
-    beside = values[:, private.corridor.boundary_neighbours]
-    np.testing.assert_array_equal(private.at_places(values), np.hstack([values, beside]))
-    assert task().at_places(values) is values
-
-
 def test_a_model_has_the_rows_and_the_centre_of_the_task():
     config = resolve("short-highway", {"privacy": SumRelease, "query_spans": (1, 2)})
     model, expected = make_model(config), make_task(config)
