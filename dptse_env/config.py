@@ -19,13 +19,12 @@ from dptse_env.estimators.settings import (
     tuned_settings,
     tuned_with,
 )
+from dptse_env.measurement import Detectors, FusionSettings
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.release import (
     RELEASE_MODELS,
     BandwidthUnit,
-    Detectors,
-    FusionSettings,
     PacedSettings,
     PrivacySettings,
     QueryOptions,
@@ -253,19 +252,35 @@ def _privacy(path: str, value: Any, base: PrivacySettings, corridor: Corridor) -
     blind = "one that needs no vehicles, as 'paper', on a road of measured fields"
     is_served = has_vehicles(corridor.recordings) or not model.needs_vehicles
     require(is_served, f"{path}.preset", blind, RELEASE_MODELS.name_of(value.preset))
+    own = f"'seeded' {_with_model(value)}, whose noise is its own"
+    require(value.noise == "seeded" or model.takes_noise, f"{path}.noise", own, value.noise)
     return value
 
 
-def _penetration(path: str, value: Any, base: Penetration, corridor: Corridor) -> Penetration:
+def _with_model(privacy: PrivacySettings) -> str:
+    return f"with the release model {RELEASE_MODELS.name_of(privacy.preset)!r}"
+
+
+def _knows_groups(privacy: PrivacySettings) -> bool:
+    return bool(RELEASE_MODELS.find(privacy.preset).knows_groups)
+
+
+def _penetration(
+    path: str, value: Any, base: Penetration, corridor: Corridor, privacy: PrivacySettings
+) -> Penetration:
     """Return the connected vehicles; a number, or a pair of numbers, is their share."""
     fields = value if isinstance(value, Mapping | Penetration) else {"share": value}
     found: Penetration = _typed(path, fields, base)
     whole = found.is_complete or has_vehicles(corridor.recordings)
     require(whole, f"{path}.share", "1 on a road of measured fields", found.share)
+    alike = f"1 {_with_model(privacy)}, which knows of no groups of columns"
+    require(found.is_complete or _knows_groups(privacy), f"{path}.share", alike, found.share)
     return found
 
 
-def _detectors(path: str, value: Any, base: Detectors, corridor: Corridor) -> Detectors:
+def _detectors(
+    path: str, value: Any, base: Detectors, corridor: Corridor, privacy: PrivacySettings
+) -> Detectors:
     """Return the errors of the fixed sensors, which there must be."""
     found: Detectors = _typed(path, value, base)
     n, factor = len(corridor.fixed_sensors), found.factor
@@ -274,6 +289,8 @@ def _detectors(path: str, value: Any, base: Detectors, corridor: Corridor) -> De
     exact = "left out on a road without fixed sensors, and on one of measured fields"
     has_any = n > 0 and has_vehicles(corridor.recordings)
     require(has_any or found == Detectors(), path, exact, found)
+    alike = f"left out {_with_model(privacy)}, which knows of no groups of columns"
+    require(found == Detectors() or _knows_groups(privacy), path, alike, found)
     return found
 
 
@@ -329,8 +346,7 @@ def _spans(
     check_spans(n, spans)
     if max(spans) > 1:
         model = RELEASE_MODELS.find(privacy.preset)
-        name = RELEASE_MODELS.name_of(model)
-        plain = f"(1,) with the release model {name!r}, which releases no sums"
+        plain = f"(1,) {_with_model(privacy)}, which releases no sums"
         require(model.releases_sums, path, plain, spans)
         alike = "(1,) where mainline segments differ in length"
         require(len(set(corridor.segment_lengths[:n])) == 1, path, alike, spans)
@@ -441,8 +457,8 @@ class Keyword(NamedTuple):
 KEYWORDS = {
     "corridor": Keyword(_corridor),
     "privacy": Keyword(_privacy, ("corridor",)),
-    "penetration": Keyword(_penetration, ("corridor",)),
-    "detectors": Keyword(_detectors, ("corridor",)),
+    "penetration": Keyword(_penetration, ("corridor", "privacy")),
+    "detectors": Keyword(_detectors, ("corridor", "privacy")),
     "fusion": Keyword(),
     "estimator": Keyword(partial(_part, ESTIMATORS)),
     "backend": Keyword(_backend, ("estimator",)),

@@ -8,20 +8,22 @@ from typing import Any
 
 from dptse_env.config import TIME_STEP, EnvConfig
 from dptse_env.estimators import Estimator, make_estimator
-from dptse_env.model import ARZModel
-from dptse_env.release import (
+from dptse_env.measurement import (
     BOUNDARIES,
-    RELEASE_MODELS,
-    VOID_REASONS,
     BoundaryModel,
     DetectorErrors,
     Fusion,
+    make_groups,
+)
+from dptse_env.model import ARZModel
+from dptse_env.release import (
+    RELEASE_MODELS,
+    VOID_REASONS,
     PrivacyReport,
     QueryOptions,
     ReleaseModel,
     Task,
     Traffic,
-    make_groups,
 )
 from dptse_env.release.report import in_order
 from dptse_env.spaces.actions import ACTION_ENCODINGS, ActionEncoding
@@ -130,19 +132,16 @@ def make_model(config: EnvConfig) -> ARZModel:
 
 
 def make_task(config: EnvConfig, n_episodes: int = 1) -> Task:
-    """Make what is measured in a batch of episodes.
-
-    Raises:
-        ValueError: The release model knows of no groups of columns, and there are some.
-    """
-    privacy = config.privacy
+    """Make what is measured in a batch of episodes."""
+    privacy, model = config.privacy, RELEASE_MODELS.find(config.privacy.preset)
     return Task(
         name=RELEASE_MODELS.name_of(privacy.preset),
-        model=RELEASE_MODELS.find(privacy.preset),
         settings=privacy,
         corridor=config.corridor,
         queries=config.queries,
         horizon=config.horizon_steps,
+        flow_centre=model.flow_centre(config.corridor, privacy),
+        has_prices=model.has_prices,
         n_episodes=n_episodes,
         groups=make_groups(
             config.penetration,
@@ -155,8 +154,8 @@ def make_task(config: EnvConfig, n_episodes: int = 1) -> Task:
 
 def make_traffic(config: EnvConfig, library: RecordLibrary | None = None) -> Traffic:
     """Make the tables of the true traffic; nothing is recorded or loaded."""
-    task = make_task(config)
-    reads_vehicles = task.model.needs_vehicles or not task.is_whole
+    task, model = make_task(config), RELEASE_MODELS.find(config.privacy.preset)
+    reads_vehicles = model.needs_vehicles or not task.is_whole
     populations = [group.population for group in task.groups] if reads_vehicles else []
     return Traffic(config.corridor, config.traffic_seeds, library or RecordLibrary(), populations)
 
@@ -171,8 +170,9 @@ def make_release(
         n_episodes: Size n of the batch.
         traffic: The true traffic; made of the user's records if None.
     """
-    task = make_task(config, n_episodes)
-    return task.model(task, make_traffic(config) if traffic is None else traffic)
+    task, model = make_task(config, n_episodes), RELEASE_MODELS.find(config.privacy.preset)
+    release: ReleaseModel = model(task, make_traffic(config) if traffic is None else traffic)
+    return release
 
 
 def privacy_report(config: EnvConfig) -> PrivacyReport:

@@ -12,8 +12,9 @@ import numpy as np
 
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate, Measurement, check_estimate
+from dptse_env.measurement import nominal_state
 from dptse_env.parts import Parts, complete_report
-from dptse_env.release import Request, check_released, nominal_state
+from dptse_env.release import Request, check_released
 from dptse_env.spaces.actions import PendingPicks, check_decision
 from dptse_env.spaces.observations import AGE_CAP, PublicState
 from dptse_env.spaces.rewards import EstimationError, ScoredSecond, estimation_error

@@ -366,7 +366,7 @@ MUTANTS = (
         "test_guarantee.py",
     ),
     Mutant(
-        "queries have the whole budget beside the sensors' part", 14, "release/sensors.py",
+        "queries have the whole budget beside the sensors' part", 14, "measurement/sensors.py",
         'Group("queries", 1.0 - share, penetration)', 'Group("queries", 1.0, penetration)',
         "test_guarantee.py",
     ),
@@ -486,7 +486,7 @@ MUTANTS = (
         "errors of detectors are drawn from the stream of the noise", 17, "process.py",
         "self.detectors.reset(episodes, for_detectors)",
         "self.detectors.reset(episodes, for_noise)",
-        "release/test_sensors.py",
+        "measurement/test_sensors.py",
     ),
     Mutant(
         "streams are spawned from 32 bits", 17, "process.py",
@@ -536,13 +536,13 @@ MUTANTS = (
         "release/test_noise.py",
     ),
     Mutant(
-        "a seeded guarantee does not say so", 18, "release/base.py",
+        "a seeded guarantee does not say so", 18, "release/settings.py",
         'against = "" if self.noise == "secure" else', 'against = "" if self.noise else',
         "release/test_paced.py",
     ),
     Mutant(
-        "a model whose noise is its own says that it is secure", 18, "release/base.py",
-        'has_noise = self.settings.noise == "seeded" or', "has_noise = True or",
+        "a model whose noise is its own says that it is secure", 18, "config.py",
+        'require(value.noise == "seeded" or model.takes_noise,', "require(True,",
         "test_streams.py",
     ),
     # --- from distances to the guarantee ------------------------------------------------------
@@ -560,32 +560,32 @@ MUTANTS = (
         "test_non_interference.py",
     ),
     Mutant(
-        "nominal boundary inputs are the true ones", 20, "release/boundary.py",
+        "nominal boundary inputs are the true ones", 20, "measurement/boundary.py",
         '"nominal": NominalBoundary,', '"nominal": TrueBoundary,',
-        "release/test_boundary.py",
+        "measurement/test_boundary.py",
     ),
     Mutant(
-        "true boundary inputs void nothing", 20, "release/boundary.py",
+        "true boundary inputs void nothing", 20, "measurement/boundary.py",
         'void_reasons: ClassVar[tuple[str, ...]] = ("boundary_inputs",)', "pass",
         "release/test_report.py",
     ),
     Mutant(
-        "released boundary flows are read around the reference speed", 20, "release/boundary.py",
+        "released boundary flows are read around v_0", 20, "measurement/boundary.py",
         "np.maximum(density, self._least_density) + centre",
         "np.maximum(density, self._least_density) + model.reference_speed",
-        "release/test_boundary.py",
+        "measurement/test_boundary.py",
     ),
     Mutant(
-        "the noise of an answer is not divided by the share", 20, "release/fusion.py",
+        "the noise of an answer is not divided by the share", 20, "measurement/fusion.py",
         "sigma[:, queries, 0] = np.sqrt((sigma[:, queries, 0] / p) ** 2 + sampling)",
         "sigma[:, queries, 0] = np.sqrt(sigma[:, queries, 0] ** 2 + sampling)",
-        "release/test_fusion.py",
+        "measurement/test_fusion.py",
     ),
     Mutant(
-        "the noise of a flow is not divided by the share", 20, "release/fusion.py",
+        "the noise of a flow is not divided by the share", 20, "measurement/fusion.py",
         "np.sqrt((sigma[:, queries, 1] / p) ** 2 + sampling * square)",
         "np.sqrt(sigma[:, queries, 1] ** 2 + sampling * square)",
-        "release/test_fusion.py",
+        "measurement/test_fusion.py",
     ),
     Mutant(
         "answers are divided by the true share", 20, "process.py",
@@ -670,9 +670,9 @@ MUTANTS = (
         "test_streams.py",
     ),
     Mutant(
-        "the boundary remembers the release of the episode before", 23, "release/boundary.py",
+        "the boundary remembers the release of the episode before", 23, "measurement/boundary.py",
         "self._has_release[episodes] = False", "self._has_release = self._has_release.copy()",
-        "release/test_boundary.py",
+        "measurement/test_boundary.py",
     ),
     Mutant(
         "the tracer outlasts a reset", 23, "release/pacing.py",

@@ -12,10 +12,11 @@ import pytest
 
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate
+from dptse_env.measurement import Detectors
 from dptse_env.parts import make_parts, make_release
 from dptse_env.privacy import ROUNDING, mu_of
 from dptse_env.process import QueryProcess
-from dptse_env.release import CappedSettings, Detectors, Paced, PacedSettings, Pacing, Request
+from dptse_env.release import CappedSettings, Paced, PacedSettings, Pacing, Request
 from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
 from tests.helpers import AWAY, fast_and_slow, make_env, play, record
 from tests.release.worlds import ONE, Worlds

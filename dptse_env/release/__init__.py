@@ -1,16 +1,5 @@
-"""Release of traffic data: the task, true traffic, release models, sensors and boundary inputs."""
+"""Release of traffic data: the task, true traffic, and release models."""
 
-from dptse_env.release.base import (
-    BoundaryInputs,
-    Group,
-    PrivacySettings,
-    ReleaseModel,
-    Request,
-    Task,
-    check_released,
-)
-from dptse_env.release.boundary import BOUNDARIES, BoundaryModel, nominal_state
-from dptse_env.release.fusion import Fusion, FusionSettings
 from dptse_env.release.gaussian import (
     Capped,
     CappedSettings,
@@ -19,11 +8,13 @@ from dptse_env.release.gaussian import (
     Paper,
     require_gaussian,
 )
+from dptse_env.release.model import ReleaseModel, check_released
 from dptse_env.release.paced import Paced, PacedSettings
 from dptse_env.release.pacing import Pacing
 from dptse_env.release.queries import MOST_OPTIONS, BandwidthUnit, QueryOptions
 from dptse_env.release.report import VOID_REASONS, PrivacyReport, QuantityReport
-from dptse_env.release.sensors import DetectorErrors, Detectors, make_groups
+from dptse_env.release.settings import BoundaryInputs, PrivacySettings
+from dptse_env.release.task import Group, Request, Task
 from dptse_env.release.vehicles import Traffic
 from dptse_env.utils.registry import Registry
 
@@ -41,20 +32,14 @@ theorem needs, with capped contributions, and with paced ledgers; the last two g
 every query policy."""
 
 __all__ = [
-    "BOUNDARIES",
     "MOST_OPTIONS",
     "RELEASE_MODELS",
     "VOID_REASONS",
     "BandwidthUnit",
     "BoundaryInputs",
-    "BoundaryModel",
     "Capped",
     "CappedSettings",
     "Corrected",
-    "DetectorErrors",
-    "Detectors",
-    "Fusion",
-    "FusionSettings",
     "GaussianRelease",
     "Group",
     "Paced",
@@ -70,7 +55,5 @@ __all__ = [
     "Task",
     "Traffic",
     "check_released",
-    "make_groups",
-    "nominal_state",
     "require_gaussian",
 ]

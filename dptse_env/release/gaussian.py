@@ -24,16 +24,11 @@ from dptse_env.privacy import (
     printed_noise_std,
     single_noise_std,
 )
-from dptse_env.release.base import (
-    CHANGES,
-    BoundaryInputs,
-    PrivacySettings,
-    ReleaseModel,
-    Request,
-    Task,
-)
+from dptse_env.release.model import ReleaseModel
 from dptse_env.release.noise import Noise
 from dptse_env.release.report import PrivacyReport, QuantityReport, in_order
+from dptse_env.release.settings import CHANGES, BoundaryInputs, PrivacySettings
+from dptse_env.release.task import Request, Task
 from dptse_env.release.vehicles import Ledgers, Traffic, require_exact_sums
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import FloatArray, IntArray

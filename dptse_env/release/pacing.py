@@ -14,8 +14,8 @@ import numpy as np
 
 from dptse_env.model.network import Layout, make_layout
 from dptse_env.model.parameters import SECONDS_PER_HOUR
-from dptse_env.release.base import Task
 from dptse_env.release.queries import QueryOptions
+from dptse_env.release.task import Task
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
 

@@ -174,10 +174,10 @@ SHIPPED_BLOCKS = (
     Block("picked", _options, 0, 1, lambda state, _: state.picked,
           is_default=lambda _, one_by_one: one_by_one),
     Block("last_price", _options, -5, 5, _log_prices, lambda _: PRICE_UNIT,
-          is_default=lambda task, _: task.model.has_prices),
+          is_default=lambda task, _: task.has_prices),
     Block("tracer", _mainline, 0, 1,
           lambda state, _: 0.0 if state.tracer is None else state.tracer,
-          is_default=lambda task, _: task.model.has_prices),
+          is_default=lambda task, _: task.has_prices),
 )  # fmt: skip
 """The shipped blocks; the default observation has those that are in it, in this order."""
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dptse_env.model.network import make_layout
-from dptse_env.release import Group, Paced, PacedSettings, QueryOptions, Task
+from dptse_env.release import Group, Paced, PacedSettings, QueryOptions
 from dptse_env.release.pacing import EventPacing, TripPacing
 from dptse_env.traffic import SHORT_HIGHWAY
 from tests.helpers import UNEVEN
 
-from .worlds import ONE, WHOLE
+from .worlds import ONE, WHOLE, task_of
 
 BUDGET, PACE, RATIO = 2.0, 0.8, 1.0
 N, S, LENGTH = SHORT_HIGHWAY.n_mainline, SHORT_HIGHWAY.n_segments, SHORT_HIGHWAY.segment_length
@@ -30,7 +30,7 @@ def make(
     road = dataclasses.replace(road, fixed_sensors=sensors)
     queries = QueryOptions.make(road.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1)
     settings = PacedSettings(pace=PACE, ratio=RATIO, boundary_inputs=boundary)
-    task = Task("paced", Paced, settings, road, queries, 240, n_episodes, groups)
+    task = task_of(Paced, settings, road, queries, n_episodes, groups)
     pacing = kind(task, BUDGET * task.shares)
     pacing.reset(np.arange(n_episodes))
     return pacing

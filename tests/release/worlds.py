@@ -45,6 +45,14 @@ def streams(*seeds):
     return [np.random.default_rng(seed) for seed in seeds]
 
 
+def task_of(model, settings, road, queries, n_episodes=1, groups=WHOLE):
+    """What a release model of a class measures of a road in a batch of episodes."""
+    return Task(
+        settings.preset, settings, road, queries, road.duration, model.flow_centre(road, settings),
+        model.has_prices, n_episodes, groups,
+    )  # fmt: skip
+
+
 class Worlds:
     """Records in place of a library: traffic seed k is the k-th of them."""
 
@@ -65,14 +73,12 @@ class Worlds:
         queries = QueryOptions.make(
             self.road.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1
         )
-        task = Task(
-            settings.preset, kind or RELEASE_MODELS[settings.preset], settings, self.road, queries,
-            self.road.duration, n, groups,
-        )  # fmt: skip
+        model = kind or RELEASE_MODELS[settings.preset]
+        task = task_of(model, settings, self.road, queries, n, groups)
         populations = [group.population for group in groups]
         traffic = Traffic(self.road, tuple(range(n)), self, populations)
         traffic.load(np.arange(n))
-        return task.model(task, traffic)
+        return model(task, traffic)
 
     def started(self, settings, seed=0, ledgers=None, **keywords):
         """A release model whose episodes have begun, with other ledgers if a class is given."""

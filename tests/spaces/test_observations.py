@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import Estimate
-from dptse_env.release import Corrected, PrivacySettings, QueryOptions, Task
+from dptse_env.release import Corrected, PrivacySettings, QueryOptions
 from dptse_env.spaces.observations import (
     AGE_CAP,
     ObservationEncoding,
@@ -12,6 +12,7 @@ from dptse_env.spaces.observations import (
 )
 from dptse_env.traffic import Corridor, Demand
 from tests.helpers import SumRelease
+from tests.release.worlds import task_of
 
 N, S = 4, 6
 ROAD = Corridor(
@@ -23,7 +24,7 @@ ROAD = Corridor(
 
 def encoding(blocks=("default",), epsilon=0.1, model=Corrected, **changes):
     settings, queries = PrivacySettings(epsilon=epsilon), QueryOptions.make(N, 2)
-    task = Task("own", model, settings, ROAD, queries, 100)
+    task = task_of(model, settings, ROAD, queries)
     return ObservationEncoding(task, blocks, **changes)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from dptse_env.estimators import Estimate, Measurement
 from dptse_env.model.parameters import SECONDS_PER_HOUR
-from dptse_env.release.base import Task
+from dptse_env.release import Task
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import Interval, checked_fields
 

@@ -10,10 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from dptse_env.config import resolve
 from dptse_env.estimators import Measurement
-from dptse_env.model import ARZModel, load_parameters
-from dptse_env.parts import make_model, make_parts, make_release
-from dptse_env.process import QueryProcess
-from dptse_env.release.boundary import (
+from dptse_env.measurement.boundary import (
     BOUNDARIES,
     PrivateBoundary,
     free_flow_density,
@@ -21,9 +18,11 @@ from dptse_env.release.boundary import (
     nominal_inputs,
     nominal_state,
 )
+from dptse_env.model import ARZModel, load_parameters
+from dptse_env.parts import make_model, make_parts, make_release
+from dptse_env.process import QueryProcess
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, randomised
-
-from .worlds import ONE
+from tests.release.worlds import ONE
 
 CENTRE = 0.5 * SHORT_HIGHWAY.speed_limit
 R = SHORT_HIGHWAY.n_boundaries

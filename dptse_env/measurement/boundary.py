@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from dptse_env.estimators import Measurement
 from dptse_env.model import ARZModel
-from dptse_env.release.base import BoundaryInputs, Task
-from dptse_env.release.vehicles import Traffic
+from dptse_env.release import BoundaryInputs, Task, Traffic
 from dptse_env.traffic import Corridor
 from dptse_env.traffic.demand import value_at
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray

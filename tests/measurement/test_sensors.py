@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.parts import make_interface, make_parts, make_release, privacy_report
+from dptse_env.measurement import Detectors, make_groups
+from dptse_env.parts import make_parts, make_release, privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.process import QueryProcess
-from dptse_env.release import Detectors, Group, make_groups
+from dptse_env.release import Group
 from dptse_env.release.noise import BLOCK
 from dptse_env.traffic import Penetration
 from tests.helpers import SumRelease, lock_step, pairwise
-
-from .worlds import LENGTH, ONE
+from tests.release.worlds import LENGTH, ONE
 
 SHARE = 0.3
 N, SENSORS = 6, (3, 5, 7)
@@ -96,9 +96,12 @@ def test_groups_are_queries_and_sensors_with_their_parts_of_the_budget():
 
 
 def test_a_model_that_knows_of_no_groups_is_refused_before_anything_is_recorded():
-    for keywords in ({"penetration": 0.5}, {"detectors": {"dropout": 0.1}}):
-        with pytest.raises(ValueError, match=r"^penetration\.share must be 1, .*SumRelease'"):
-            make_interface(resolve("short-highway", {"privacy": SumRelease, **keywords}))
+    for keywords, message in (
+        ({"penetration": 0.5}, r"penetration\.share must be 1"),
+        ({"detectors": {"dropout": 0.1}}, "detectors must be left out"),
+    ):
+        with pytest.raises(ValueError, match=rf"^{message} with the release model .*SumRelease'"):
+            resolve("short-highway", {"privacy": SumRelease, **keywords})
     assert make_release(resolve("short-highway", {"privacy": SumRelease})).task.is_whole
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from dptse_env.estimators import Measurement
-from dptse_env.release.base import Group, Request, Task
+from dptse_env.release import Group, Request, Task
 from dptse_env.traffic import Corridor, Penetration
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval, checked_fields

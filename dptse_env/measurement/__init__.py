@@ -1,0 +1,16 @@
+"""What the estimator is given: boundary inputs, errors of detectors, and answers put together."""
+
+from dptse_env.measurement.boundary import BOUNDARIES, BoundaryModel, nominal_state
+from dptse_env.measurement.fusion import Fusion, FusionSettings
+from dptse_env.measurement.sensors import DetectorErrors, Detectors, make_groups
+
+__all__ = [
+    "BOUNDARIES",
+    "BoundaryModel",
+    "DetectorErrors",
+    "Detectors",
+    "Fusion",
+    "FusionSettings",
+    "make_groups",
+    "nominal_state",
+]
