@@ -1,7 +1,7 @@
-"""Import of recorded trajectories: files of points of vehicles become records of a corridor.
+"""Import of recorded trajectories, which become the records of a road.
 
-`import_trajectories` writes a folder with a road file, on which everything works that works on a
-simulated road. Tables are read by polars (extra ``corridors``).
+`import_trajectories` writes a folder with a road file, which is used like that of a simulated road.
+polars reads the tables (extra ``corridors``).
 """
 
 from dptse_env.utils.registry import needed_for

@@ -58,20 +58,20 @@ BUSIEST = 4000.0
 FASTEST, SLOWEST = 200.0, 5.0
 """Speeds [km/h] that few exceed, and that some do."""
 FEW = 0.01
-"""Share of the cells that may be beyond these limits, by noise; more tell of another unit."""
+"""Share of the cells that noise may put beyond these limits; more are a sign of another unit."""
 SLOW = 0.4
 """Share of the limit that vehicles exceed where they drive freely."""
 BLOCK_TIME = 10.0
-"""Time [s] over which it is told whether vehicles that enter stay or leave."""
+"""Time [s] over which vehicles that enter must stay or leave."""
 SURE, SURER = 0.65, 0.15
 """Least conservation of vehicles in a field, and least lead over that with rows and columns
 swapped: 0.75 to 0.9 and 0.0 to 0.55 were seen in measured and simulated traffic."""
 FEWEST_BLOCKS = 30
-"""Blocks by which it is told."""
+"""Blocks that this takes at least."""
 MOST_MISSED, MOST_UNSEEN, NEAR = 20.0, 8.0, 0.2
-"""Vehicles that must have passed a cell with nothing in it before it is told to be off, the sum of
-those that must have been in it in each interval, lest they were between two looks at it by chance,
-and the length of road [km] on a side by which it is told, of one cell at least."""
+"""Least number of vehicles that passed an empty cell if its detector was off, and least sum of
+those that were in it in each interval, since a few may pass between two looks; and the length of
+road [km] on a side, of one cell at least, whose traffic shows that."""
 USUAL_SHARE = 0.5
 """Share of the flow at other times that they must have where they are on one side alone."""
 LARGEST_NUMBER = 1e6
@@ -363,7 +363,7 @@ class FieldSource:
 
     @property
     def _names(self) -> tuple[str, str]:
-        """What a cell and an interval are in the files."""
+        """Names of a cell and of an interval in the files."""
         return ("column", "row") if self.transposed else ("row", "column")
 
     def _line(self, cell: int, table: AnyArray) -> str:

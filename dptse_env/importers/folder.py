@@ -1,4 +1,4 @@
-"""The folder of an import: a road file, records, a manifest and a report, all of them or none."""
+"""Folder of an import: road file, records, manifest and report, which appear together."""
 
 from __future__ import annotations
 

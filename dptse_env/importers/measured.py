@@ -1,4 +1,4 @@
-"""Demand, exit shares and average dwell of a road, as its records have them."""
+"""Demand, exit shares and average dwell of a road, as measured on its records."""
 
 import dataclasses
 import warnings

@@ -1,4 +1,4 @@
-"""Places of points on a road: branch, position along the road and record column."""
+"""Placement of points on a road: branch, position along the road and record column."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """One file of trajectories: its points become vehicles at whole seconds, cut into windows.
 
 Points wait on disk in buckets, each with all points of some vehicles, and are read one bucket at a
-time. What grows in memory is a row for each vehicle and for each second.
+time. Memory grows with the number of vehicles and of seconds alone.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MOST_WAITING = 1_000_000
 LONGEST_SILENCE = 600.0
 """Time without any row [s] after which a file is another recording, with windows of its own."""
 LONGEST_PAUSE = 30.0
-"""Time without any row [s] from which on it is told that the road counts as empty."""
+"""Time without any row [s] from which on the report says that the road counts as empty."""
 MOST_WINDOWS = 100_000
 """Windows of a file at most; wrong times would otherwise ask for millions."""
 LARGEST_NUMBER = 10_000

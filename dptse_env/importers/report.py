@@ -1,4 +1,4 @@
-"""The report of an import: Markdown to read, JSON to process, a picture to look at."""
+"""Report of an import: as Markdown, as JSON and as a picture."""
 
 from __future__ import annotations
 

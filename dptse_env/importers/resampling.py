@@ -1,4 +1,4 @@
-"""From points at any times to one row for each vehicle and whole second."""
+"""Resampling of points at any times to a row for each vehicle and whole second."""
 
 from __future__ import annotations
 

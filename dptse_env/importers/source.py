@@ -1,6 +1,6 @@
-"""The meaning of a file of trajectories: format, columns, units, and the road's place in it.
+"""Description of a file of trajectories: format, columns, units, and the road's place in it.
 
-All of it can be given in a TOML file with the fields of `Source`; ``docs/guides/your-data.md`` has
+It can be given as a TOML file with the fields of `Source`; ``docs/guides/your-data.md`` has
 examples.
 """
 

@@ -1,8 +1,8 @@
 """Files of trajectories as one lazy table, whatever their format.
 
-A format is a declaration: which column has which role, in which unit, and what else is special.
-Every file becomes a `polars.LazyFrame` with the columns of `SCHEMA`, which is read in chunks.
-Fields are read as text and numbers are made of it, so that a field that is none stays a row.
+A format declares the role and the unit of each column, and what else is special. Every file becomes
+a `polars.LazyFrame` with the columns of `SCHEMA`, which is read in chunks. Fields are read as text
+and parsed afterwards, so that a row with a malformed number is kept and can be named.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SCHEMA = {
 }
 """Columns of a table of points. `row` is the row of the file as an editor counts it; times are in
 seconds, lengths in kilometres, speeds in km/h. What a file does not have is null, and so is the
-vehicle of a row that tells a time alone; `bad` is the role of a field that is no finite number."""
+vehicle of a row that has a time alone; `bad` is the role of a field that is no finite number."""
 
 BYTES = 40
 """Bytes that a point takes in XML or JSON at least."""
@@ -42,7 +42,7 @@ CHUNK = 25_000
 LARGEST_JSON = 1 << 28
 """Bytes of a JSON file, which is read at once and takes up six times as much memory."""
 HEAD = 1 << 16
-"""Bytes at the start of a text file by which its delimiter and columns are told."""
+"""Bytes at the start of a text file that show its delimiter and columns."""
 PARQUET = (".parquet", ".pq")
 MISSING = ("", "nan", "null", "none", "<na>")
 """Texts of a label that is missing, in lower case."""
@@ -61,12 +61,12 @@ class Format:
     Attributes:
         columns: names that a column may have, by role; compared without regard to case and ``-``.
         units: unit by quantity.
-        required: roles that must be there; others are read where they are.
+        required: roles that a file must have; others are read if it has them.
         headless: columns of the same table as a text without header.
         lists: fields of a JSON document that are lists of one length, with an entry a point.
         adjust: changes the points of a file, given its path and the source.
-        sumo: whether it is SUMO's, where lanes are named ``edge_lane`` and times are those of the
-            beginning of the step that ends with the state.
+        sumo: whether it is SUMO's: lanes are named ``edge_lane``, and the time of a state is that
+            at which the step before it begins.
     """
 
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""SUMO's configuration files (``.sumocfg``): which files and options a simulation has."""
+"""SUMO's configuration files (``.sumocfg``): the files and options of a simulation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ REFUSED = {
     "weight-files": "travel times of edges, which a digest does not cover",
     "device.fcd-replay.files": "positions of vehicles, which a digest does not cover",
 }
-"""Options that cannot be kept, and what they stand for."""
+"""Options that cannot be kept, and their meaning."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Files:
             begin: second of SUMO's clock at which it begins.
 
         Returns:
-            What a recording leaves out or changes, for people.
+            Sentences for people on what a recording leaves out or changes.
 
         Raises:
             ValueError: There is none, one cannot be read or is empty, or it reads another file,

@@ -19,7 +19,7 @@ NEWEST_VERSION = (1, 20)
 VEHICLE_CLASS = "passenger"
 """Lanes that this class may not use (bus lanes, hard shoulders, pavements) do not count."""
 
-# `sumolib` checks no element: one that is missing or of no use meets it as one of these.
+# `sumolib` checks no element: one that is missing or malformed becomes one of these.
 _BROKEN = (*UNREADABLE, OSError, SAXException, AttributeError, TypeError)
 
 
@@ -135,7 +135,7 @@ class Net:
         return way
 
     def remarks(self, path: Sequence[Any]) -> Iterator[str]:
-        """Yield what is unusual of a path: traffic lights and roundabouts on it."""
+        """Yield sentences for people on traffic lights and roundabouts on a path."""
         for edge in path[:-1]:
             junction = edge.getToNode()
             if junction and "traffic_light" in (junction.getType() or ""):

@@ -1,4 +1,4 @@
-"""A corridor made of a segmentation, with the demand and the exit shares of one simulated run."""
+"""Corridor of a segmentation, with the demand and the exit shares of one simulated run."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class ImportedRoad:
 
     Attributes:
         corridor: the road, with demand, exit shares and average dwell counted in `record`.
-        segments: where its segments are in the net.
+        segments: its segments in the net.
         record: the run that was counted.
-        remarks: what was unusual, for people.
+        remarks: sentences for people on what is unusual.
     """
 
     corridor: Corridor
@@ -68,7 +68,7 @@ def import_road(
         seed: traffic seed of the run that is counted.
 
     Raises:
-        ValueError: Files or fields are of no use, SUMO refuses the files, or no vehicle uses the
+        ValueError: Files or fields are malformed, SUMO refuses the files, or no vehicle uses the
             path.
     """
     if begin is None:

@@ -1,4 +1,4 @@
-"""Geometry of a path: where it is cut into segments, its ramps, and the edges that each covers."""
+"""Segmentation of a path: its segments, its ramps, and the stretches of edges of each."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SECONDS_ON_SEGMENT = 1.2
 
 @dataclass(frozen=True)
 class Segmentation:
-    """The segments of a road, and where they are in the net.
+    """Segments of a road, and their stretches of edges in the net.
 
     Attributes:
         lengths: (N,) length of each mainline segment [m].
@@ -50,8 +50,8 @@ class Segmentation:
             or leaves.
         ramp_limits: speed limit of each ramp [km/h], on-ramps first.
         columns: stretches of each record column.
-        names: what each ramp is in the net, on-ramps first.
-        remarks: what was unusual, for people.
+        names: edges of each ramp at the path, on-ramps first.
+        remarks: sentences for people on what is unusual.
     """
 
     lengths: tuple[float, ...]
@@ -94,7 +94,7 @@ def segment_path(
             ends; None for the end of that edge.
 
     Raises:
-        ValueError: The net or the path is of no use, a position is not on its edge, the path is
+        ValueError: The net or the path is malformed, a position is not on its edge, the path is
             too short, or ramps are too near to one another or to its ends; the message names the
             file or the field.
     """
