@@ -67,14 +67,7 @@ class Trajectories(Environment):
     """Values that columns must have, as column=value."""
     shares: Shares = SHARES
     """Shares of the windows for training, validation and test, in this order of time."""
-    longest_gap: float = Options.longest_gap
-    """Longest time without points of a vehicle that is filled by interpolation [s]."""
-    skip_start: float = Options.skip_start
-    """Seconds left out at the start of each file."""
-    skip_end: float = Options.skip_end
-    """Seconds left out at the end of each file."""
-    pause: int = Options.pause
-    """Seconds left out between two windows."""
+    options: Annotated[Options, arg(name="")] = Options()  # noqa: RUF009 (frozen)
 
     def run(self) -> None:
         """Import, and print which traffic seeds there are and what to do next."""
@@ -87,7 +80,7 @@ class Trajectories(Environment):
             self.corridor(),
             self.output,
             splits(self.shares),
-            Options(self.longest_gap, self.skip_start, self.skip_end, self.pause),
+            self.options,
             {key: value for key, value in environment.items() if key != "traffic_seeds"},
         )
         for file in imported.report["files"]:
