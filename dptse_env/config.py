@@ -37,7 +37,6 @@ from dptse_env.traffic import (
     CORRIDORS,
     Corridor,
     Penetration,
-    find_corridor,
     is_road_file,
     randomised,
     read_road,
@@ -73,9 +72,9 @@ TrafficSeed = Annotated[int, Interval(0, 2**31 - 1)]
 """A traffic seed, as SUMO takes it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class EnvConfig:
-    """Everything that an environment is made of.
+    """Everything that an environment is made of, read of its keywords.
 
     Attributes:
         corridor: The road, its demand, incident and fixed sensors.
@@ -113,15 +112,11 @@ class EnvConfig:
             the recorded training seeds in place of this default.
         truth_in_info: Whether ``info`` shows the true traffic.
         inherited: Keywords whose values were measured or tuned on another road than this one, or
-            with other ARZ parameters, and that nobody gave; filled in by `resolve`.
-        origins: Text in front of messages on keywords that a road file gave, by keyword; filled in
-            by `resolve`.
-
-    Raises:
-        ValueError: A value is out of range.
+            with other ARZ parameters, and that nobody gave; as `resolve` finds them.
+        origins: Text in front of messages on keywords that a road file gave, by keyword.
     """
 
-    corridor: Corridor
+    corridor: Corridor = CORRIDORS["paper-highway"]
     estimator: Any = "ekf"
     backend: str = "compiled"
     parameters: str | ARZParameters = "paper"
@@ -131,10 +126,10 @@ class EnvConfig:
     bandwidth_unit: BandwidthUnit = "segments"
     action: Any = "mask"
     observation: tuple[Any, ...] = (DEFAULT,)
-    privacy: PrivacySettings = field(default_factory=PrivacySettings)
-    penetration: Penetration = field(default_factory=Penetration)
-    detectors: Detectors = field(default_factory=Detectors)
-    fusion: FusionSettings = field(default_factory=FusionSettings)
+    privacy: PrivacySettings = field(default=PrivacySettings())
+    penetration: Penetration = field(default=Penetration())
+    detectors: Detectors = field(default=Detectors())
+    fusion: FusionSettings = field(default=FusionSettings())
     reward: Any = "joint"
     horizon: Annotated[int, Interval(1, 100_000)] | None = None
     random_start: bool = False
@@ -143,10 +138,42 @@ class EnvConfig:
     inherited: tuple[str, ...] = field(default=(), compare=False)
     origins: Mapping[str, str] = field(default_factory=dict, compare=False, repr=False)
 
-    def __post_init__(self) -> None:
-        """Read every field by `KEYWORDS`, so that lists become tuples and all is checked."""
-        values = {name: getattr(self, name) for name in KEYWORDS}
-        for name, value in read_keywords(values, values, {}).items():
+    def __init__(
+        self,
+        base: EnvConfig | None = None,
+        *,
+        inherited: tuple[str, ...] = (),
+        origins: Mapping[str, str] | None = None,
+        **values: Any,
+    ) -> None:
+        """Read keywords in the order of `KEYWORDS`, each with those that it needs.
+
+        Args:
+            base: A configuration that the keywords change; None for the defaults.
+            inherited: See the attribute.
+            origins: See the attribute.
+            **values: Values of `KEYWORDS` and `SHORTCUTS`, which may be plain JSON.
+
+        Raises:
+            UnknownKeywordError: There is no such keyword.
+            ValueError: A value is out of range; the message starts with its origin and path.
+        """
+        places = origins or {}
+        fields: dict[str, Any] = {"inherited": inherited, "origins": places}
+        for key in values:
+            if key not in {*KEYWORDS, *SHORTCUTS}:
+                raise _unknown(key, places.get(key, ""))
+        for name, keyword in KEYWORDS.items():
+            value, needs = getattr(base or EnvConfig, name), [fields[n] for n in keyword.needs]
+            if name not in values and keyword.default is not None:
+                value = keyword.default(value, *needs)
+            given = {name: values.get(name, value)}
+            given |= {key: {key: values[key]} for key in values if SHORTCUTS.get(key) == name}
+            for key, each in given.items():
+                with within(places.get(key, "")):
+                    value = keyword.read(name, each, value, *needs)
+            fields[name] = value
+        for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -222,7 +249,10 @@ def _corridor(path: str, value: Any, base: Corridor) -> Corridor:
     every traffic seed; an incident also ``"none"``.
     """
     if not isinstance(value, Mapping):
-        return find_corridor(value)
+        found = CORRIDORS.find(value)
+        made: Corridor = found() if callable(found) else found
+        require(isinstance(made, Corridor), path, "a Corridor, or what returns one", made)
+        return made
     names = {"demand": ("preset", "random"), "incident": ("preset", "random", "none")}
     named = {key: value[key] for key in names if isinstance(value.get(key), str)}
     corridor = base.replaced({key: each for key, each in value.items() if key not in named})
@@ -485,47 +515,21 @@ SHORTCUTS = {
 """Keywords that stand for a field of another one."""
 
 
-def read_keywords(
-    values: Mapping[str, Any], base: Mapping[str, Any], origins: Mapping[str, str]
-) -> dict[str, Any]:
-    """Return the fields of `EnvConfig` that keywords stand for.
-
-    Args:
-        values: Values by keyword.
-        base: Values of all fields, which ``values`` change.
-        origins: Text in front of messages, by keyword.
-
-    Raises:
-        ValueError: A value is out of range; the message starts with its origin and path.
-    """
-    found: dict[str, Any] = {}
-    for name, keyword in KEYWORDS.items():
-        value, needs = base[name], [found[need] for need in keyword.needs]
-        if name not in values and keyword.default is not None:
-            value = keyword.default(value, *needs)
-        given = {name: values.get(name, value)}
-        given |= {key: {key: values[key]} for key in values if SHORTCUTS.get(key) == name}
-        for key, each in given.items():
-            with within(origins.get(key, "")):
-                value = keyword.read(name, each, value, *needs)
-        found[name] = value
-    return found
-
-
 PRESETS = {
-    "paper-highway": EnvConfig(corridor=CORRIDORS["paper-highway"]),
+    "paper-highway": EnvConfig(),
     "private-highway": EnvConfig(
-        corridor=randomised(CORRIDORS["paper-highway"]),
+        demand="random",
+        incident="random",
         parameters="w99-3lane",
         privacy=PacedSettings(epsilon=5.0),
     ),
     "long-highway": EnvConfig(
-        corridor=CORRIDORS["long-highway"],
+        corridor="long-highway",
         parameters="w99-3lane",
         bandwidth=8,
         privacy=PacedSettings(epsilon=5.0),
     ),
-    "short-highway": EnvConfig(corridor=CORRIDORS["short-highway"], bandwidth=2),
+    "short-highway": EnvConfig(corridor="short-highway", bandwidth=2),
 }
 """Configurations by name."""
 
@@ -571,11 +575,7 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
             del table["estimator_settings"]
         origins = {"corridor": f"{path}: ", **dict.fromkeys(table, f"{path}: environment.")}
         values, assumed = {**table, **overrides, "corridor": road.corridor}, road.assumed
-    for key in values:
-        if key not in {*KEYWORDS, *SHORTCUTS}:
-            raise _unknown(key, origins.get(key, ""))
-    fields = read_keywords(values, {name: getattr(base, name) for name in KEYWORDS}, origins)
-    config = EnvConfig(**fields, origins=origins)
+    config = EnvConfig(base, origins=origins, **values)
     inherited = _inherited(config, values, assumed)
     if not inherited:
         return config

@@ -249,7 +249,7 @@ def configuration(one_of):
     if sensors and one_of(True, False):
         options["detectors"] = one_of(Detectors(dropout=0.3), Detectors(budget_share=0.6))
     return EnvConfig(
-        dataclasses.replace(ROAD, fixed_sensors=sensors, speed_limit=limit),
+        corridor=dataclasses.replace(ROAD, fixed_sensors=sensors, speed_limit=limit),
         estimator=estimator,
         privacy=privacy,
         bandwidth=one_of(1, 3, 6),
@@ -422,7 +422,7 @@ WORST = {
 @pytest.mark.parametrize(("privacy", "options", "zero", "one"), WORST.values(), ids=WORST)
 def test_the_worst_trips_are_as_far_apart_as_mu_and_no_further(privacy, options, zero, one):
     config = EnvConfig(
-        dataclasses.replace(ROAD, fixed_sensors=(1,) if options == BOTH_SEE else ()),
+        corridor=dataclasses.replace(ROAD, fixed_sensors=(1,) if options == BOTH_SEE else ()),
         estimator="open_loop",
         privacy=privacy,
         bandwidth=6,

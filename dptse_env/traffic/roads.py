@@ -122,26 +122,6 @@ CORRIDORS = Registry(
 """Corridors by name."""
 
 
-def find_corridor(value: Any) -> Corridor:
-    """Return a corridor by name, of a road file, by ``"package.module:NAME"``, or as it is.
-
-    A string that ends in ``.toml`` is a road file (`read_road`); a function returns the corridor.
-
-    Raises:
-        ValueError: There is none, or it is no `Corridor`.
-    """
-    if is_road_file(value):
-        return read_corridor(value)
-    corridor = CORRIDORS.find(value)
-    if not isinstance(corridor, Corridor) and callable(corridor):
-        corridor = corridor()
-    if not isinstance(corridor, Corridor):
-        raise ValueError(
-            f"corridor {shown(value)} must be a Corridor, or return one, got {shown(corridor)}"
-        )
-    return corridor
-
-
 def randomised(corridor: Corridor) -> Corridor:
     """Return `corridor` with a random demand level and incident for every traffic seed.
 

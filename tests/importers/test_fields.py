@@ -11,7 +11,7 @@ import pytest
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.importers.fields import UNITS, FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import Split
-from dptse_env.traffic import RecordLibrary, find_corridor
+from dptse_env.traffic import RecordLibrary, read_corridor
 
 SPLITS = [
     Split("training", 0.5, TRAINING_SEEDS),
@@ -39,7 +39,7 @@ def write(folder, cells=10, intervals=90, **changes):
 def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
     corridor, seeds = import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
     assert seeds == {"training": (0, 1), "validation": (1000,), "test": (2000,)}
-    assert find_corridor(str(tmp_path / "road" / "road.toml")) == corridor
+    assert read_corridor(str(tmp_path / "road" / "road.toml")) == corridor
     assert corridor.segment_length == pytest.approx(0.1)
     assert corridor.density_scale == 444.0
     assert corridor.measured == ("demand", "average_dwell")

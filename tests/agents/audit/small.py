@@ -27,7 +27,7 @@ def config(bandwidth=2, horizon=None, estimator="open_loop", **privacy):
     if privacy["preset"] == "capped":
         privacy = {"cap": 6, **privacy}
     settings = RELEASE_MODELS.find(privacy["preset"]).settings_type(**privacy)
-    made = EnvConfig(ROAD, privacy=settings, bandwidth=bandwidth, horizon=horizon)
+    made = EnvConfig(corridor=ROAD, privacy=settings, bandwidth=bandwidth, horizon=horizon)
     return dataclasses.replace(made, estimator=estimator)
 
 
