@@ -22,6 +22,7 @@ from dptse_env.importers.folder import (
 )
 from dptse_env.importers.measured import with_measured
 from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
+from dptse_env.importers.units import odd_unit
 from dptse_env.traffic.corridor import SHORTEST_SEGMENT, Corridor
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.imported import ranges
@@ -234,27 +235,17 @@ class FieldSource:
         return each
 
     def _check_unit(self, kind: str, odd: Callable[[float], str | None]) -> None:
-        """Refuse data that are odd in a unit that nobody gave, and name likely ones.
+        """Refuse data that are odd in a unit that nobody gave; see `odd_unit`.
 
         Args:
             kind: Of the data.
             odd: What is odd about the data times a factor, or None.
         """
-        problem, path, known = odd(1.0), getattr(self, kind), UNITS[kind]
-        if problem is None:
-            return
-        given = getattr(self, f"{kind}_unit")
-        if given is not None:
-            warnings.warn(
-                f"{path}: is {kind}_unit {given} right, as given? {problem}", stacklevel=4
-            )
-            return
-        likely = [name for name, factor in known.items() if odd(factor) is None]
-        raise ValueError(
-            f"{path}: {kind}_unit must be that of the data, likely "
-            f"{' or '.join(likely) or 'none that is known'}, got {USUAL[kind]!r}: {problem}; a "
-            "unit that is given is kept"
-        )
+        problem, given = odd(1.0), getattr(self, f"{kind}_unit")
+        if problem is not None:
+            likely = [name for name, factor in UNITS[kind].items() if odd(factor) is None]
+            unit, where = given or USUAL[kind], str(getattr(self, kind))
+            odd_unit(where, f"{kind}_unit", unit, given is not None, likely, problem)
 
     def _check_values(self, density: FloatArray, other: FloatArray, lanes: int) -> None:
         """Refuse a few values that no road can have, and tell of a number that may be a sign.

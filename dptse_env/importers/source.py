@@ -37,7 +37,7 @@ driving direction."""
 
 
 class TrajectoryError(ValueError):
-    """A file of trajectories cannot be imported; the message names file, row and field."""
+    """A file cannot be imported; the message names it, and row and field where there are some."""
 
 
 @dataclass(frozen=True)

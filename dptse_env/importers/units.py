@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -127,22 +127,34 @@ def check_units(
         TrajectoryError: They do, and a unit is not given; the message has the units that fit.
 
     Warns:
-        UserWarning: They do in a file whose units are all given.
+        UserWarning: They do, and all units are given.
     """
     if moves.is_usual(SLOWEST if whole else LIKELY_SPEEDS[0]):
         return
     quantities = ("time", "length") if moves.ratio is None else tuple(UNITS)
-    likely = _likely(moves, source, units)
-    if likely or (whole and not set(quantities) <= set(source.units)):
-        raise TrajectoryError(
-            f"{where}: units must be those of the data, likely "
-            f"{' or '.join(likely) or 'none that are known'}, got {stated(units)}: {moves}; a unit "
-            "that is given is kept"
-        )
-    if whole:
-        warnings.warn(
-            f"{where}: are the units right, as given ({stated(units)})? {moves}", stacklevel=2
-        )
+    likely, given = _likely(moves, source, units), set(quantities) <= set(source.units)
+    if likely or whole:
+        odd_unit(where, "units", stated(units), given, likely, str(moves))
+
+
+def odd_unit(
+    where: str, name: str, unit: str, given: bool, likely: Sequence[str], problem: str
+) -> None:
+    """Refuse data with a `problem` in a unit that nobody gave, and name `likely` ones.
+
+    Raises:
+        TrajectoryError: Nobody gave the unit of the field `name`.
+
+    Warns:
+        UserWarning: It was given, and is kept.
+    """
+    if given:
+        warnings.warn(f"{where}: {name}, as given: {unit}; is that right? {problem}", stacklevel=5)
+        return
+    raise TrajectoryError(
+        f"{where}: {name} must fit the data, likely {' or '.join(likely) or 'none that is known'}, "
+        f"got {unit}: {problem}; a unit that is given is kept"
+    )
 
 
 def _likely(moves: Motion, source: Source, units: Mapping[str, str]) -> list[str]:

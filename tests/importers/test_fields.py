@@ -127,9 +127,9 @@ def test_fields_of_no_use_are_refused_and_leave_nothing(changes, road, duration,
     [
         (
             {"density_unit": None},
-            r"density\.txt: density_unit .* likely veh/ft or veh/m, got 'veh/km'",
+            r"density\.txt: density_unit .* likely veh/ft or veh/m, got veh/km",
         ),
-        ({"speed": None}, r"flow\.txt: flow_unit .* likely veh/s, got 'veh/h'.* given is kept"),
+        ({"speed": None}, r"flow\.txt: flow_unit .* likely veh/s, got veh/h.* given is kept"),
     ],
 )
 def test_forgotten_units_are_refused_with_the_likely_one(changes, message, tmp_path):
@@ -150,7 +150,9 @@ def test_forgotten_units_are_refused_with_the_likely_one(changes, message, tmp_p
 def test_a_unit_that_is_given_is_kept_and_what_is_odd_is_told(kind, unit, problem, tmp_path):
     changes = {"speed": None, "flow": tmp_path / "flow.txt"} if kind == "flow" else {}
     source = write(tmp_path, **changes, **{f"{kind}_unit": unit})
-    with pytest.warns(UserWarning, match=rf"{kind}\.txt: is {kind}_unit {unit} right.* {problem}"):
+    with pytest.warns(
+        UserWarning, match=rf"{kind}\.txt: {kind}_unit, as given: {unit}; is that right.* {problem}"
+    ):
         density, flow = source.read(100, 110.0)
     table = UNITS[kind][unit] * np.loadtxt(tmp_path / f"{kind}.txt")
     got = {"density": density, "flow": flow, "speed": flow / density}[kind]
@@ -160,8 +162,8 @@ def test_a_unit_that_is_given_is_kept_and_what_is_odd_is_told(kind, unit, proble
 def test_speeds_in_metres_a_second_are_told_in_light_traffic_alone(tmp_path):
     source = write(tmp_path, speed_unit=None)
     np.savetxt(tmp_path / "speed.txt", np.full((10, 90), 29.0))
-    allowed = r"likely m/s or mi/h, got 'km/h': speeds are 29 km/h in light traffic, at a limit"
-    with pytest.raises(ValueError, match=rf"speed\.txt: speed_unit must be .*{allowed} of 110"):
+    allowed = r"likely m/s or mi/h, got km/h: speeds are 29 km/h in light traffic, at a limit"
+    with pytest.raises(ValueError, match=rf"speed\.txt: speed_unit must fit .*{allowed} of 110"):
         source.read(4, 110.0)
     np.savetxt(tmp_path / "density.txt", np.full((10, 90), 0.02))  # 16 veh/km a lane
     with pytest.warns(UserWarning, match=r"no speed of the field is above 29 km/h, at a limit of"):
@@ -188,7 +190,7 @@ def test_a_few_cells_may_be_odd(name, usual, odd, message, tmp_path):
     assert source.read(4, 110.0)[0].shape == (10, 90)
     table.flat[:10] = odd
     np.savetxt(tmp_path / f"{name}.txt", table)
-    with pytest.raises(ValueError, match=rf"{name}\.txt: {name}_unit must be .*{message}"):
+    with pytest.raises(ValueError, match=rf"{name}\.txt: {name}_unit must fit .*{message}"):
         source.read(4, 110.0)
 
 

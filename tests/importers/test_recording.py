@@ -381,12 +381,12 @@ def scaled(path, factors, speed):
         ([1, 1, 1, 3.6], "units.speed = 'km/h'"),
         ([1, 1, 1 / 0.3048, 1 / 0.3048], "units.length = 'ft', units.speed = 'ft/s'"),
         ([1, 1000, 0.001, 2.23694], "units.time = 'ms', units.length = 'km', units.speed = 'mi/h'"),
-        ([1, 1, 0.01, 0.01], "none that are known"),
+        ([1, 1, 0.01, 0.01], "none that is known"),
     ],
 )
 def test_units_that_cannot_be_are_refused_with_those_that_fit(factors, units, tmp_path):
     path = scaled(tmp_path / "a.csv", factors, speed=35.0 if units[0] == "u" else 20.0)
-    message = re.escape(f"a.csv: units must be those of the data, likely {units}, got time in s, ")
+    message = re.escape(f"a.csv: units must fit the data, likely {units}, got time in s, ")
     with pytest.raises(TrajectoryError, match=rf"{message}.* by positions, at [\d.e+]+ times"):
         run(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
@@ -403,7 +403,7 @@ def test_units_that_cannot_be_are_refused_with_those_that_fit(factors, units, tm
 @pytest.mark.filterwarnings("ignore:no vehicle is on the mainline")
 def test_units_that_are_given_are_kept_and_what_is_odd_is_told(factors, told, tmp_path):
     path = plain(tmp_path / "a.csv", stream(seconds=240.0) * np.array(factors))
-    with pytest.warns(UserWarning, match=rf"a\.csv: are the units right, as given .*{told}"):
+    with pytest.warns(UserWarning, match=rf"a\.csv: units, as given: time in s, .*{told}"):
         imported = run(path, dataclasses.replace(PLAIN, units=UNITS))
     speed = record_of(imported).speed
     np.testing.assert_allclose(speed, 72.0 * factors[3], rtol=1e-4)
