@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from operator import getitem
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,7 @@ class QueryProcess:
         fusion: Turns releases into measurements of all vehicles; None where they are these.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
+        start: Second that it began at, shape (n,).
         traffic_index: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
         queried: The options of each episode's last query, shape (n, G).
         age: Steps since each mainline segment was last observed, shape (n, n_mainline).
@@ -92,7 +94,7 @@ class QueryProcess:
         self.pending = PendingPicks(n, queries.n_options)
         self.traffic_index = np.zeros(n, dtype=np.int64)
         self.time = np.zeros(n, dtype=np.int64)
-        self.end = np.zeros(n, dtype=np.int64)
+        self.start = np.full(n, -self.config.horizon_steps, dtype=np.int64)
         self.queried = np.zeros((n, queries.n_options), dtype=bool)
         self.n_dropped = np.zeros(n, dtype=np.int64)
         self.age = np.zeros((n, queries.n_mainline), dtype=np.int64)
@@ -151,7 +153,7 @@ class QueryProcess:
         for index in self.traffic.load(traffic):
             self.boundary.load(index)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
-        self.end[episodes] = starts + self.config.horizon_steps
+        self.start[episodes] = starts
         self.pending.reset(episodes)
         if self.detectors is not None:
             self.detectors.reset(episodes, for_detectors)
@@ -165,7 +167,8 @@ class QueryProcess:
         self.released[episodes] = 0.0
         estimate = self._estimated(episodes)
         self._score(episodes, estimate)
-        return self._outcome(episodes, estimate, np.zeros(len(episodes)))
+        reward, observed = np.zeros(len(episodes)), self._observed(episodes, estimate)
+        return Outcome(observed, reward, self.over[episodes])
 
     def step(self, episodes: IntArray, actions: Action) -> Outcome:
         """Carry out one action in each of ``episodes``.
@@ -186,30 +189,30 @@ class QueryProcess:
         if n_ready == len(episodes):
             self._advance(episodes, decision.queried)
             estimate = self._estimated(episodes)
-            return self._outcome(episodes, estimate, self._score(episodes, estimate))
+            reward = self._score(episodes, estimate)
+            return Outcome(self._observed(episodes, estimate), reward, self.over[episodes])
         reward = np.zeros(len(episodes))
         if n_ready > 0:
             acting = episodes[ready]
             self._advance(acting, decision.queried[ready])
             reward[ready] = self._score(acting, self._estimated(acting))
-        return self._outcome(episodes, self.estimate.at(episodes), reward)
+        return Outcome(self.observe(episodes), reward, self.over[episodes])
 
     @property
     def elapsed(self) -> IntArray:
         """Seconds since each episode began, shape (n,)."""
-        return self.time - self.end + self.config.horizon_steps
+        return self.time - self.start
 
     @property
     def over(self) -> BoolArray:
         """Flags of episodes that are at their end or were never reset, shape (n,)."""
-        return self.time >= self.end
+        return self.time - self.start >= self.release.task.horizon
 
     def _advance(self, episodes: IntArray, queried: BoolArray) -> None:
         """Advance one second: predict, release, update, and store the query."""
         traffic = self.traffic_index[episodes]
         inputs = self.boundary.inputs(episodes, traffic, self.time[episodes])
-        predict, update = self.estimator.predict, self.estimator.update
-        self._threads.run(len(episodes), lambda block: predict(episodes[block], inputs[block]))
+        self._threads.run(self.estimator.predict, episodes, inputs, getitem)
         own = slice(None) if self.n_episodes == 1 else episodes  # a slice is quicker to write to
         self.time[own] += 1
         observed = self.release.task.observed(queried)
@@ -219,9 +222,9 @@ class QueryProcess:
         request = Request(episodes, traffic, self.time[episodes], observed, prediction)
         measured = self.measure(request)
         self.boundary.update(episodes, measured)
-        self._threads.run(len(episodes), lambda block: update(episodes[block], measured.at(block)))
+        self._threads.run(self.estimator.update, episodes, measured, Measurement.at)
         self.queried[own] = queried
-        rows = slice(self.model.rows.n_rows)
+        rows = slice(self.released.shape[1])
         answered = measured.observed[:, rows, None]
         self.released[own] = np.where(answered, measured.values[:, rows], self.released[own])
         covered = self.release.task.covered(measured.observed)
@@ -262,7 +265,7 @@ class QueryProcess:
 
     def _score(self, episodes: IntArray, estimate: Estimate) -> FloatArray:
         """Compare estimates of ``episodes`` with the truth; return the rewards, shape (k,)."""
-        n, truth = self.interface.n_mainline, self.truth(episodes)
+        n, truth = self.interface.queries.n_mainline, self.truth(episodes)
         true_density, true_speed = truth[:, :n, 0], truth[:, :n, 1]
         error = estimation_error(
             true_density, true_speed, estimate.density[:, :n], estimate.speed[:, :n]
@@ -284,12 +287,9 @@ class QueryProcess:
 
     def observe(self, episodes: IntArray) -> Observation:
         """Return the present observations of ``episodes``, shape (k, size)."""
-        return self._encoded(episodes, self.estimate.at(episodes))
+        return self._observed(episodes, self.estimate.at(episodes))
 
-    def _outcome(self, episodes: IntArray, estimate: Estimate, reward: FloatArray) -> Outcome:
-        return Outcome(self._encoded(episodes, estimate), reward, self.over[episodes])
-
-    def _encoded(self, episodes: IntArray, estimate: Estimate) -> Observation:
+    def _observed(self, episodes: IntArray, estimate: Estimate) -> Observation:
         public = self.release.public(episodes)
         state = PublicState(
             estimate=estimate,

@@ -267,10 +267,6 @@ def check_decision(encoding: ActionEncoding, decision: Any, n_actions: int) -> N
         )
 
 
-def _all_complete(queried: BoolArray, n_dropped: IntArray) -> Decision:
-    return Decision(queried, n_dropped, np.ones(len(queried), dtype=bool))
-
-
 class MaskAction(ActionEncoding):
     """``MultiBinary(n)``: one flag per option.
 
@@ -288,7 +284,7 @@ class MaskAction(ActionEncoding):
         wanted = array != 0
         if array.dtype.kind != "b" and np.count_nonzero(array != wanted):
             raise ValueError(f"action must hold 0 and 1 only, got {array.tolist()}")
-        return _all_complete(*self._cut(episodes, wanted, pending))
+        return Decision(*self._cut(episodes, wanted, pending), np.ones(len(wanted), dtype=bool))
 
     def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
         """See `ActionEncoding.encode`."""
@@ -312,7 +308,8 @@ class ScoresAction(ActionEncoding):
             raise ValueError(f"action must hold finite floats, got {array.tolist()}")
         order = np.argsort(-array, axis=1, kind="stable")
         queried = first_that_fit(order, self.costs, self.bandwidth)
-        return _all_complete(queried, np.zeros(len(episodes), dtype=np.int64))
+        k = len(episodes)
+        return Decision(queried, np.zeros(k, dtype=np.int64), np.ones(k, dtype=bool))
 
     def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
         """See `ActionEncoding.encode`."""
@@ -344,7 +341,7 @@ class SlotsAction(ActionEncoding):
             # A repeat that nothing replaces asks for nothing that is not served.
             repeats = self.most_queries - wanted.sum(axis=1)
             n_dropped += np.minimum(repeats, added.sum(axis=1))
-        return _all_complete(queried, n_dropped)
+        return Decision(queried, n_dropped, np.ones(len(queried), dtype=bool))
 
     def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
         """See `ActionEncoding.encode`; slots that are left over repeat the first one."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -79,21 +80,37 @@ class ObservationBlock(Protocol):
         """Return finite values of k episodes, shape (k, size), or one number for all of them."""
 
 
+Transform = Callable[[FloatArray, float], FloatArray]
+"""Function of values and their unit."""
+
+
 @dataclass(frozen=True)
 class Block:
-    """A block that ships with the package: its values over a unit, or the logarithms of these.
+    """A block that ships with the package: a field of the public state, or a constant, in a unit.
 
-    See `ObservationBlock`. ``is_default(task, picks_one_by_one)`` says whether the default
-    observation has it.
+    Attributes:
+        name: Name.
+        size: Number of values.
+        low: Lower bound; values below are clipped.
+        high: Upper bound; values above are clipped.
+        field: Attribute of `PublicState`, such as ``"estimate.speed"``; empty for a constant.
+        unit: Unit of the values.
+        part: Index into the field; None for all of it.
+        constant: The value where there is no field, or while it is None.
+        transform: Makes values of the field and the unit, in place of their quotient.
+        is_default: Whether the default observation has it, by the task and by whether actions pick
+            one by one.
     """
 
     name: str
     size: Callable[[Task], int]
     low: float
     high: float
-    values: Callable[[PublicState, Task], AnyArray | float]
+    field: str
     unit: Callable[[Task], float] = lambda task: 1.0
-    is_log: bool = False
+    part: Callable[[Task], Any] | None = None
+    constant: Callable[[Task], float] = lambda task: 0.0
+    transform: Transform | None = None
     is_default: Callable[[Task, bool], bool] = lambda task, one_by_one: True
 
     def __reduce__(self) -> tuple[Callable[[str], Block], tuple[str]]:
@@ -132,52 +149,48 @@ def _flow_scale(task: Task) -> float:
     return task.corridor.density_scale * task.corridor.speed_scale
 
 
-def _released(component: int) -> Any:
-    return lambda state, task: state.released[:, : task.queries.n_options, component]
+def _of_options(component: int) -> Callable[[Task], Any]:
+    return lambda task: (slice(None), slice(task.queries.n_options), component)
 
 
-def _innovation(component: int) -> Any:
-    return lambda state, task: state.innovations[:, : task.queries.n_options, component]
+def _of_sensors(component: int) -> Callable[[Task], Any]:
+    return lambda task: (slice(None), task.sensors, component)
 
 
-def _fixed_innovation(component: int) -> Any:
-    return lambda state, task: state.innovations[:, task.sensors, component]
+def _log(values: FloatArray, unit: float) -> FloatArray:
+    # Zero has no logarithm; that of the smallest number is clipped to the lower bound.
+    return np.log(np.maximum(values / unit, _TINY))
 
 
-def _log_prices(state: PublicState, _: Task) -> FloatArray | float:
-    if state.prices is None:
-        return 0.0
-    return np.where(state.prices > 0.0, np.log10(np.maximum(state.prices, _TINY)), 0.0)
+def _log_price(prices: FloatArray, unit: float) -> FloatArray:
+    return np.where(prices > 0.0, np.log10(np.maximum(prices, _TINY)), 0.0) / unit
 
 
 SHIPPED_BLOCKS = (
-    Block("density", _segments, 0, 4, lambda state, _: state.estimate.density, _density_scale),
-    Block("speed", _segments, 0, 4, lambda state, _: state.estimate.speed, _speed_scale),
-    Block("density_log_std", _segments, -10, 5,
-          lambda state, _: state.estimate.density_std, _density_scale, is_log=True),
-    Block("speed_log_std", _segments, -10, 5,
-          lambda state, _: state.estimate.speed_std, _speed_scale, is_log=True),
-    Block("released_density", _options, -5, 5, _released(0), _density_scale),
-    Block("released_speed", _options, -5, 5, _released(1), _speed_scale,
+    Block("density", _segments, 0, 4, "estimate.density", _density_scale),
+    Block("speed", _segments, 0, 4, "estimate.speed", _speed_scale),
+    Block("density_log_std", _segments, -10, 5, "estimate.density_std", _density_scale,
+          transform=_log),
+    Block("speed_log_std", _segments, -10, 5, "estimate.speed_std", _speed_scale, transform=_log),
+    Block("released_density", _options, -5, 5, "released", _density_scale, _of_options(0)),
+    Block("released_speed", _options, -5, 5, "released", _speed_scale, _of_options(1),
           is_default=lambda task, _: not task.releases_flow),
-    Block("released_flow", _options, -5, 5, _released(1), _flow_scale,
+    Block("released_flow", _options, -5, 5, "released", _flow_scale, _of_options(1),
           is_default=lambda task, _: task.releases_flow),
-    Block("density_innovation", _options, -10, 10, _innovation(0)),
-    Block("speed_innovation", _options, -10, 10, _innovation(1)),
-    Block("age", _mainline, 0, 1, lambda state, _: state.age, lambda _: AGE_CAP),
-    Block("queried", _options, 0, 1, lambda state, _: state.queried),
-    Block("fixed_density_innovation", _fixed, -10, 10, _fixed_innovation(0)),
-    Block("fixed_speed_innovation", _fixed, -10, 10, _fixed_innovation(1)),
-    Block("bandwidth", lambda _: 1, 0, 1,
-          lambda _, task: task.queries.bandwidth, lambda task: task.corridor.n_mainline),
-    Block("epsilon", lambda _: 1, -6, 6, lambda _, task: float(np.log10(task.settings.epsilon))),
-    Block("picked", _options, 0, 1, lambda state, _: state.picked,
-          is_default=lambda _, one_by_one: one_by_one),
-    Block("last_price", _options, -5, 5, _log_prices, lambda _: PRICE_UNIT,
+    Block("density_innovation", _options, -10, 10, "innovations", part=_of_options(0)),
+    Block("speed_innovation", _options, -10, 10, "innovations", part=_of_options(1)),
+    Block("age", _mainline, 0, 1, "age", lambda _: AGE_CAP),
+    Block("queried", _options, 0, 1, "queried"),
+    Block("fixed_density_innovation", _fixed, -10, 10, "innovations", part=_of_sensors(0)),
+    Block("fixed_speed_innovation", _fixed, -10, 10, "innovations", part=_of_sensors(1)),
+    Block("bandwidth", lambda _: 1, 0, 1, "", lambda task: task.corridor.n_mainline,
+          constant=lambda task: task.queries.bandwidth),
+    Block("epsilon", lambda _: 1, -6, 6, "",
+          constant=lambda task: float(np.log10(task.settings.epsilon))),
+    Block("picked", _options, 0, 1, "picked", is_default=lambda _, one_by_one: one_by_one),
+    Block("last_price", _options, -5, 5, "prices", lambda _: PRICE_UNIT, transform=_log_price,
           is_default=lambda task, _: task.has_prices),
-    Block("tracer", _mainline, 0, 1,
-          lambda state, _: 0.0 if state.tracer is None else state.tracer,
-          is_default=lambda task, _: task.has_prices),
+    Block("tracer", _mainline, 0, 1, "tracer", is_default=lambda task, _: task.has_prices),
 )  # fmt: skip
 """The shipped blocks; the default observation has those that are in it, in this order."""
 
@@ -231,7 +244,7 @@ class ObservationEncoding:
         self.task = task
         defaults = default_blocks(task, picks_one_by_one=picks_one_by_one)
         names = [name for value in blocks for name in _expanded(value, defaults)]
-        self.blocks: tuple[ObservationBlock, ...] = tuple(map(_made, names))
+        self.blocks: tuple[Block | ObservationBlock, ...] = tuple(map(_made, names))
         sizes = [_checked_size(block, task) for block in self.blocks]
         ends = np.cumsum(sizes).tolist()
         self.slices: dict[str, slice] = {}
@@ -242,26 +255,36 @@ class ObservationEncoding:
         low = np.repeat([block.low for block in self.blocks], sizes).astype(np.float32)
         high = np.repeat([block.high for block in self.blocks], sizes).astype(np.float32)
         self.space = spaces.Box(low, high, dtype=np.float32)
-        self._plan, self._units = [], np.ones(len(low))
+        self._shipped, self._foreign, self._units = [], [], np.ones(len(low))
+        self._constants = np.zeros(len(low))
         for block in self.blocks:
-            place, log_unit = self.slices[block.name], None
-            if isinstance(block, Block) and block.is_log:
-                log_unit = block.unit(task)
-            elif isinstance(block, Block):
-                self._units[place] = block.unit(task)
-            self._plan.append((block, place, is_foreign(block), log_unit))
+            place = self.slices[block.name]
+            if not isinstance(block, Block):
+                self._foreign.append((block, place))
+                continue
+            unit, part = block.unit(task), block.part and block.part(task)
+            self._constants[place] = block.constant(task)
+            if block.transform is None:
+                self._units[place] = unit
+            if block.field:
+                field = attrgetter(block.field)
+                self._shipped.append((place, field, part, block.transform, unit))
 
     def encode(self, state: PublicState) -> Observation:
         """Return the observations of k episodes, shape (k, size), always inside the space."""
         k = len(state.age)
-        raw = np.empty((k, self.space.shape[0]))
-        for block, place, is_checked, log_unit in self._plan:
-            values: Any = block.values(state, self.task)
-            if is_checked:
-                _check_values(block, values, (k, place.stop - place.start))
-            if log_unit is not None:
-                # Zero has no logarithm; that of the smallest number is clipped to the lower bound.
-                values = np.log(np.maximum(values / log_unit, _TINY))
+        raw = np.empty((k, self._constants.size))
+        raw[:] = self._constants
+        for place, field, part, transform, unit in self._shipped:
+            values: Any = field(state)
+            if values is None:
+                continue
+            if part is not None:
+                values = values[part]
+            raw[:, place] = values if transform is None else transform(values, unit)
+        for block, place in self._foreign:
+            values = block.values(state, self.task)
+            _check_values(block, values, (k, place.stop - place.start))
             raw[:, place] = values
         flat = np.empty(raw.shape, dtype=np.float32)
         np.divide(raw, self._units, out=flat, casting="same_kind")
@@ -283,7 +306,7 @@ def _expanded(value: Any, defaults: list[str]) -> Sequence[Any]:
     return defaults if isinstance(value, str) and value == DEFAULT else [value]
 
 
-def _made(value: Any) -> ObservationBlock:
+def _made(value: Any) -> Block | ObservationBlock:
     """Return a block; one of another package must have a new name and valid bounds."""
     block = BLOCKS.find(value)
     block = block() if isinstance(block, type) else block
@@ -298,11 +321,11 @@ def _made(value: Any) -> ObservationBlock:
         numbers = isinstance(low, int | float) and isinstance(high, int | float)
         if not numbers or not block.low < block.high:
             raise ValueError(f"observation {name} must have bounds low < high, got {low}, {high}")
-    made: ObservationBlock = block
+    made: Block | ObservationBlock = block
     return made
 
 
-def _checked_size(block: ObservationBlock, task: Task) -> int:
+def _checked_size(block: Block | ObservationBlock, task: Task) -> int:
     size = block.size(task)
     if type(size) is not int or size < 0:
         raise ValueError(

@@ -10,8 +10,12 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
+from typing import Any, TypeVar
 
+from dptse_env.utils.arrays import IntArray
 from dptse_env.utils.fields import integer
+
+Data = TypeVar("Data")
 
 SMALLEST_BLOCK = 16
 """Smallest block of episodes that is worth a thread: handing over a block takes some 50 us."""
@@ -43,14 +47,27 @@ class EpisodeThreads:
         """Pickle without the threads."""
         return type(self), (self.threads,)
 
-    def run(self, n_episodes: int, work: Callable[[slice], None]) -> None:
-        """Call ``work`` on slices that cover ``n_episodes`` episodes; return when all are done.
+    def run(
+        self,
+        work: Callable[[IntArray, Data], None],
+        episodes: IntArray,
+        data: Data,
+        block_of: Callable[[Any, slice], Any],
+    ) -> None:
+        """Call ``work(episodes, data)`` on blocks of both; return when all are done.
 
         An exception in any of them is raised here, once all have stopped.
+
+        Args:
+            work: Works on some episodes and what ``data`` has of them.
+            episodes: Shape (k,).
+            data: Of the k episodes.
+            block_of: Returns a block of ``data``.
         """
+        n_episodes = len(episodes)
         n_threads = max(min(self.threads, n_episodes // SMALLEST_BLOCK), 1)
         if n_threads == 1:
-            work(slice(0, n_episodes))
+            work(episodes, data)
             return
         # More blocks than threads: a thread whose core is busy elsewhere then runs fewer of them.
         n_blocks = min(BLOCKS_PER_THREAD * n_threads, n_episodes // SMALLEST_BLOCK)
@@ -59,7 +76,7 @@ class EpisodeThreads:
 
         def drain() -> None:
             for block in blocks:
-                work(block)
+                work(episodes[block], block_of(data, block))
 
         futures = [self._threads().submit(drain) for _ in range(n_threads - 1)]
         try:

@@ -1,6 +1,7 @@
 import pickle
 import threading
 import time
+from operator import getitem
 
 import numpy as np
 import pytest
@@ -10,28 +11,31 @@ from hypothesis import strategies as st
 from dptse_env.utils.threads import SMALLEST_BLOCK, EpisodeThreads
 
 
-@given(threads=st.integers(1, 4), n_rows=st.integers(0, 1000))
-@example(threads=3, n_rows=2 * SMALLEST_BLOCK)
+@given(threads=st.integers(1, 4), n_episodes=st.integers(0, 1000))
+@example(threads=3, n_episodes=2 * SMALLEST_BLOCK)
 @settings(max_examples=20)
-def test_every_row_is_worked_on_once(threads, n_rows):
-    seen = np.zeros(n_rows, dtype=int)
+def test_every_episode_is_worked_on_once(threads, n_episodes):
+    seen = np.zeros(n_episodes, dtype=int)
 
-    def work(rows):
-        seen[rows] += 1
+    def work(episodes, data):
+        seen[episodes] += 1
+        np.testing.assert_array_equal(data, 2 * episodes)
 
-    EpisodeThreads(threads).run(n_rows, work)
+    episodes = np.arange(n_episodes)
+    EpisodeThreads(threads).run(work, episodes, 2 * episodes, getitem)
     assert (seen == 1).all()
 
 
-def workers(blocks, n_rows=2 * SMALLEST_BLOCK, n_threads=2):
+def workers(blocks, n_episodes=2 * SMALLEST_BLOCK, n_threads=2):
     """Return the threads that work at the same time."""
     together, found = threading.Barrier(n_threads, timeout=300.0), []
 
-    def work(rows):
+    def work(episodes, data):
         together.wait()
         found.append(threading.current_thread())
 
-    blocks.run(n_rows, work)
+    episodes = np.arange(n_episodes)
+    blocks.run(work, episodes, episodes, getitem)
     return {*found}
 
 
@@ -45,15 +49,16 @@ def test_large_batches_use_the_threads_and_small_ones_do_not():
 def test_an_exception_is_raised_once_nobody_works_any_more(own):
     here, together, ended = threading.current_thread(), threading.Barrier(2, timeout=300.0), []
 
-    def work(rows):
+    def work(episodes, data):
         together.wait()
         if own == (threading.current_thread() is here):
             raise ZeroDivisionError
         time.sleep(0.05)  # long enough to be seen if nobody waits
-        ended.append(rows)
+        ended.append(episodes)
 
+    episodes = np.arange(2 * SMALLEST_BLOCK)
     with pytest.raises(ZeroDivisionError):
-        EpisodeThreads(2).run(2 * SMALLEST_BLOCK, work)
+        EpisodeThreads(2).run(work, episodes, episodes, getitem)
     assert len(ended) == 1
 
 
