@@ -45,7 +45,7 @@ class Contributions:
             raise ValueError(f"privacy.preset must keep account of vehicles, got {task.name!r}")
         self._process, self._ledgers = process, process.release.ledgers
         self._is_cleared = isinstance(process.release, Paced) and task.settings.unit == "event"
-        self._covers = task.covers[task.group == 0]
+        self._covers = task.covers[task.channels.group == 0]
         shape = (process.n_episodes, process.interface.n_mainline)
         self._met, self._refused = np.zeros((2, *shape), dtype=np.int64)
         self._before: AnyArray | None = None

@@ -152,14 +152,14 @@ def repeating(
 def noise(source: NoiseSource, n: int, n_steps: int) -> Work:
     """Return work that draws the noise of a batch's releases, and adds it."""
     task = make_task(resolve("private-highway", {}))
-    shape = n, task.n_columns, 2
+    shape = n, task.n_channels, 2
     episodes, values, sigma = np.arange(n), np.zeros(shape), np.full(shape, 5.0)
-    drawn = Noise(n, task.n_columns, source)
+    drawn = Noise(n, task.n_channels, source)
     drawn.reset(episodes, [np.random.default_rng(episode) for episode in range(n)])
 
     def turn() -> int:
         for _ in range(n_steps):
-            drawn.added(episodes, values, sigma, task.length)
+            drawn.added(episodes, values, sigma, task.channels.length)
         return n * n_steps
 
     return turn

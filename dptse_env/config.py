@@ -634,5 +634,5 @@ def _inherited(
     if inherits is not None:
         centre = RELEASE_MODELS.find(config.privacy.preset).flow_centre(corridor, config.privacy)
         spans = max(config.query_spans)
-        found += inherits(corridor, centre is not None, spans, config.settings())
+        found += inherits(corridor.road, centre is not None, spans, config.settings())
     return tuple(found)

@@ -123,11 +123,11 @@ def make_model(config: EnvConfig) -> ARZModel:
     """Make the traffic model of the estimator, with a time step of one second."""
     task = make_task(config)
     return ARZModel(
-        config.corridor,
+        config.corridor.road,
         config.arz_parameters,
         TIME_STEP,
         reference_speed=task.flow_centre,
-        rows=task.rows,
+        channels=task.channels.head(task.n_on_road),
     )
 
 

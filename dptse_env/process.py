@@ -98,7 +98,7 @@ class QueryProcess:
         self.queried = np.zeros((n, queries.n_options), dtype=bool)
         self.n_dropped = np.zeros(n, dtype=np.int64)
         self.age = np.zeros((n, queries.n_mainline), dtype=np.int64)
-        self.released = np.zeros((n, self.model.rows.n_rows, 2))
+        self.released = np.zeros((n, self.model.channels.size, 2))
         self.estimate = self.estimator.estimate()
         self.error = EstimationError(np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64))
         self._is_fork = False

@@ -6,7 +6,7 @@ import dataclasses
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
+from dptse_env.model import Channels
 from dptse_env.parts import make_interface
 from dptse_env.release import ReleaseModel
+from dptse_env.road import Road, make_road
 from dptse_env.traffic import SHORT_HIGHWAY, Corridor, Demand, Record
 from dptse_env.utils.kernels import kernel
 
@@ -245,8 +247,8 @@ def record(places: Any, speeds: Any, n_columns: int = SHORT_COLUMNS) -> Record:
 
 
 @dataclasses.dataclass(frozen=True)
-class Road:
-    """A road network with the fields that the traffic model asks for, and no more."""
+class Stretch:
+    """The fields of a corridor that a road is made of, within wider limits than a corridor's."""
 
     n_mainline: int = 15
     on_ramps: tuple[int, ...] = ()
@@ -259,8 +261,18 @@ class Road:
     more_outside: int = 0
 
     @property
+    def road(self) -> Road:
+        road = make_road(self)
+        outside = np.arange(road.lanes.size) >= road.n_segments
+        return road._replace(lanes=road.lanes + self.more_outside * outside)
+
+    @property
     def n_ramps(self) -> int:
         return len(self.on_ramps) + len(self.off_ramps)
+
+    @property
+    def n_segments(self) -> int:
+        return self.n_mainline + self.n_ramps
 
     @property
     def on_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
@@ -272,21 +284,34 @@ class Road:
         return tuple((first + o,) for o in range(len(self.off_ramps)))
 
     @property
+    def boundary_neighbours(self) -> tuple[int, ...]:
+        return (0, self.n_mainline - 1, *range(self.n_mainline, self.n_segments))
+
+    @property
     def segment_lanes(self) -> tuple[int, ...]:
         return (self.lanes,) * self.n_mainline + (self.ramp_lanes,) * self.n_ramps
 
     @property
     def segment_lengths(self) -> tuple[float, ...]:
-        return (self.segment_length,) * (self.n_mainline + self.n_ramps)
-
-    @property
-    def speed_limits(self) -> tuple[float, ...]:
-        return (self.speed_limit,) * (self.n_mainline + self.n_ramps)
+        return (self.segment_length,) * self.n_segments
 
     @property
     def boundary_lanes(self) -> tuple[int, ...]:
-        lanes = (self.lanes,) * 2 + (self.ramp_lanes,) * self.n_ramps
-        return tuple(each + self.more_outside for each in lanes)
+        inside = (self.segment_lanes[s] for s in self.boundary_neighbours)
+        return tuple(lanes + self.more_outside for lanes in inside)
+
+    @property
+    def speed_limits(self) -> tuple[float, ...]:
+        return (self.speed_limit,) * self.n_segments
+
+    def with_boundaries(self, values: Sequence[Any]) -> tuple[Any, ...]:
+        return (*values, *(values[s] for s in self.boundary_neighbours))
+
+
+def make_channels(first: Sequence[int], span: Sequence[int]) -> Channels:
+    """Channels of one group on segments of 100 m."""
+    spans = np.array(span, dtype=np.int64)
+    return Channels(np.array(first, dtype=np.int64), spans, np.zeros_like(spans), 0.1 * spans)
 
 
 def compiled(part: Any) -> Any:
@@ -322,11 +347,11 @@ class SumRelease(ReleaseModel):
     def true_values(self, request):
         """Return what is released before noise is added, shape (k, n_columns, 2)."""
         task, corridor = self.task, self.task.corridor
-        n, every = corridor.n_segments, corridor.n_segments + corridor.n_boundaries
+        every = corridor.n_segments + corridor.n_boundaries
         values = self.traffic.aggregates(request.traffic, request.times, every)
         values[..., 1] = values[..., 0] * (values[..., 1] - 0.5 * corridor.speed_limit)
-        rows = task.rows.averages(values[:, :n])
-        return np.concatenate([rows, values[:, n:]], axis=1)[:, : task.n_columns]
+        weights = task.covers / task.channels.span[:, None]
+        return np.einsum("cs,nsk->nck", weights, values[:, : task.n_cells])
 
     def release(self, request):
         values = self.true_values(request).copy()

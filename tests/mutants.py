@@ -114,7 +114,7 @@ MUTANTS = (
     ),
     Mutant(
         "an empty segment has a mean speed of its own", 2, "release/gaussian.py",
-        "np.where(counts == 0.0, task.limit,", "np.where(counts == 0.0, 0.0,",
+        "np.where(counts == 0.0, limit,", "np.where(counts == 0.0, 0.0,",
         "release/test_gaussian.py",
     ),
     Mutant(
@@ -372,7 +372,7 @@ MUTANTS = (
     ),
     Mutant(
         "sensors have the noise of queries", 14, "release/gaussian.py",
-        "self.noise_std[task.group]", "self.noise_std[0 * task.group]",
+        "self.noise_std[task.channels.group]", "self.noise_std[0 * task.channels.group]",
         "test_guarantee.py",
     ),
     Mutant(
@@ -507,12 +507,12 @@ MUTANTS = (
     ),
     Mutant(
         "paced noise is never secure", 18, "release/paced.py",
-        "Noise(n, task.n_columns, settings.noise)", "Noise(n, task.n_columns)",
+        "Noise(n, task.n_channels, settings.noise)", "Noise(n, task.n_channels)",
         "test_streams.py",
     ),
     Mutant(
         "capped noise is never secure", 18, "release/gaussian.py",
-        "Noise(n, task.n_columns, task.settings.noise)", "Noise(n, task.n_columns)",
+        "Noise(n, task.n_channels, task.settings.noise)", "Noise(n, task.n_channels)",
         "test_streams.py",
     ),
     Mutant(
@@ -676,13 +676,13 @@ MUTANTS = (
     ),
     Mutant(
         "the tracer outlasts a reset", 23, "release/pacing.py",
-        "self._tracer[episodes] = 0.0", "self._tracer = self._tracer.copy()",
+        "self._paces.tracer[episodes] = 0.0", "self._tracer = self._tracer.copy()",
         "release/test_pacing.py release/test_paced.py",
     ),
     Mutant(
         "what is spent leaves out queries that overlap", 24, "release/paced.py",
-        "paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price",
-        "paid[accounts.group[c], s] = (1.0 + accounts.ratio) * price",
+        "paid[channels.group[c], s] += (1.0 + accounts.ratio) * price",
+        "paid[channels.group[c], s] = (1.0 + accounts.ratio) * price",
         "test_guarantee.py",
     ),
     Mutant(
@@ -697,8 +697,8 @@ MUTANTS = (
     ),
     Mutant(
         "what is spent is a vehicle's payment at the predicted speed", 24, "release/paced.py",
-        "paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price",
-        "paid[accounts.group[c], s] += price",
+        "paid[channels.group[c], s] += (1.0 + accounts.ratio) * price",
+        "paid[channels.group[c], s] += price",
         "test_guarantee.py",
     ),
     Mutant(

@@ -214,7 +214,7 @@ def releases(case: str) -> Numbers:
 
     def watched(request: Any) -> Measurement:
         measured: Measurement = measure(request)
-        own = measured.on_road(process.model.rows.n_rows, process.model.n_segments)
+        own = measured.on_road(process.model.channels.size, process.model.n_segments)
         seen = own.observed[0][:, None]
         values.append(np.where(seen, own.values[0], 0.0).ravel())
         sigma.append(np.where(seen, own.sigma[0], 0.0).ravel())

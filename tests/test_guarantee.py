@@ -124,7 +124,7 @@ class Reckless(Pacing):
         powers = np.random.default_rng(self.second).choice(
             [0.0, -0.3, -1.0, -2.0, -3.0, -6.0], observed.shape[1]
         )
-        return np.tile(self.budget[self.task.group] * 10.0**powers, (len(observed), 1))
+        return np.tile(self.budget[self.task.channels.group] * 10.0**powers, (len(observed), 1))
 
 
 class RecklesslyPaced(Paced):
@@ -385,7 +385,7 @@ class AtOnce(Pacing):
         self.parts = iter([1.0, ROUNDING, ROUNDING, 0.5])
 
     def prices(self, episodes, observed, density, speed):
-        whole = self.budget[self.task.group] / (1.0 + self.task.settings.ratio)
+        whole = self.budget[self.task.channels.group] / (1.0 + self.task.settings.ratio)
         return np.tile(next(self.parts, 2.0**-54) * whole, (len(observed), 1))
 
 

@@ -70,7 +70,7 @@ def test_both_backends_agree_on_an_uneven_road(road_file, estimator):
 
 
 def test_a_count_scatters_less_in_density_on_a_longer_segment():
-    model = ARZModel(ROAD, load_parameters("w99-3lane"))
+    model = ARZModel(ROAD.road, load_parameters("w99-3lane"))
     variance = count_variance(model, EstimatorSettings(count_noise=2.0))
     np.testing.assert_allclose(
         variance * ROAD.segment_lengths, 2.0 / model.density_scale**2, rtol=1e-12

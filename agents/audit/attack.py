@@ -87,7 +87,7 @@ class Overheard(ReleaseModel):
         self._either = make_release(config, 2 * n, traffic)
         self._pairs, self._factor = worlds.pairs, factor
         if factor != 1.0:
-            _set_noise(self.model, Noise(n, self.task.n_columns, scale=factor))
+            _set_noise(self.model, Noise(n, self.task.n_channels, scale=factor))
         _set_noise(self._either, _Noiseless())
         self.score, self.square = np.zeros(n), np.zeros(n)
 

@@ -123,7 +123,7 @@ def make_design(config: EnvConfig, slot: int, kind: str) -> Design:
     n_used = max(at_once // size * size, size)
     canaries: list[tuple[Trajectory, Trajectory]] = []
     plan = np.zeros((config.horizon_steps, queries.n_options), dtype=bool)
-    owner = np.full((config.horizon_steps, task.n_columns), -1)
+    owner = np.full((config.horizon_steps, task.n_channels), -1)
     for first in range(0, config.horizon_steps - slot + 1, slot):
         seconds = np.arange(first, first + slot)
         used = sites[(first // slot * n_used + np.arange(n_used)) % len(sites)]
@@ -133,7 +133,7 @@ def make_design(config: EnvConfig, slot: int, kind: str) -> Design:
             covered = task.covers[:, task.covers[pair].any(axis=0)].any(axis=1)
             owner[first : first + slot, covered] = len(canaries)
             stands, elsewhere = (
-                Trajectory.constant(seconds + 1, int(task.first[each]), 0.0)
+                Trajectory.constant(seconds + 1, int(task.channels.first[each]), 0.0)
                 for each in (pair[0], pair[-1])
             )
             fast = np.full(slot, config.corridor.largest_speed_limit)
@@ -149,13 +149,15 @@ def make_design(config: EnvConfig, slot: int, kind: str) -> Design:
 
 def apart(task: Task) -> IntArray:
     """Return query options that share no segment; the cheapest come first."""
-    taken, sites = np.zeros(task.n_places, dtype=bool), []
+    taken, sites = np.zeros(task.n_cells, dtype=bool), []
     for option in np.argsort(task.queries.cost, kind="stable").tolist():
         covered = task.covers[option]
         if not (covered & taken).any():
             taken |= covered
             sites.append(option)
-    return np.array(sorted(sites, key=lambda option: int(task.first[option])), dtype=np.int64)
+    return np.array(
+        sorted(sites, key=lambda option: int(task.channels.first[option])), dtype=np.int64
+    )
 
 
 def attack_in_one_run(

@@ -398,11 +398,11 @@ def public_terms(
     sigma, centre = (np.array(column) for column in zip(*rows, strict=True))
     task = release.task
     if task.releases_flow:
-        sigma = sigma * task.length[:, None]
+        sigma = sigma * task.channels.length[:, None]
     else:
-        sigma = sigma * np.stack([task.length, np.ones_like(task.length)], axis=1)
+        sigma = sigma * np.stack([task.channels.length, np.ones_like(task.channels.length)], axis=1)
     # Of several queries that cover a place each tells the mean of what they tell; groups add up.
-    alike_columns = task.group[:, None] == task.group
+    alike_columns = task.channels.group[:, None] == task.channels.group
     share = task.covers / np.maximum(alike_columns.astype(float) @ task.covers, 1.0)
     squares = np.einsum("tcq,cp->tpq", sigma**-2.0, share)
     return np.sqrt(squares), centre

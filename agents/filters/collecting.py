@@ -24,24 +24,27 @@ from agents.filters.network import Roads
 from agents.filters.scenarios import Scenario
 from agents.play import record
 from dptse_env.estimators import Measurement
-from dptse_env.estimators.recurrent_kernels import N_CHANNELS, Cells, make_cells, read
+from dptse_env.estimators.recurrent_kernels import N_CHANNELS, Cells, Memory, make_cells, read
 from dptse_env.evaluation import Row, evaluate
+from dptse_env.model import Channels
 from dptse_env.process import QueryProcess
 from dptse_env.traffic import Corridor, Records, open_library
 from dptse_env.utils.arrays import AnyArray, FloatArray
+from dptse_env.utils.kernels import Bundle
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """The seconds 1 to T of k episodes of a scenario, on S cells, with M rows of measurements.
+    """The seconds 1 to T of k episodes of a scenario, on S cells, with M channels.
 
     Attributes:
         corridor: The road.
         is_section: Whether it is a section of a highway.
+        channels: What is measured.
         cells: The road as the network sees it.
         start: Density [veh/km] and speed [km/h] of the prior and their deviations, (k, S, 4).
-        observed: Which rows were measured, (T, k, M).
+        observed: Which channels were measured, (T, k, M).
         values: Measurements, (T, k, M, 2).
         sigma: Their deviations, (T, k, M, 2).
         centre: Speeds [km/h] that flows are centred at, (T, k, S).
@@ -51,6 +54,7 @@ class Episodes:
 
     corridor: Corridor
     is_section: bool
+    channels: Channels
     cells: Cells
     start: AnyArray
     observed: AnyArray
@@ -108,6 +112,7 @@ def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
     return Episodes(
         corridor=process.config.corridor,
         is_section=scenario.section is not None,
+        channels=process.model.channels,
         cells=make_cells(process.model),
         start=watcher.start,
         observed=observed,
@@ -138,7 +143,7 @@ class _Recorder:
     def update(self, episodes: Any, measured: Measurement) -> None:
         """Write down the measurements, and update."""
         model = self._process.model
-        own = measured.on_road(model.rows.n_rows, model.n_segments)
+        own = measured.on_road(model.channels.size, model.n_segments)
         self.measured.append(tuple(array.copy() for array in own))
         self._estimator.update(episodes, measured)
 
@@ -189,7 +194,7 @@ class Batch:
     def __init__(self, parts: Sequence[Episodes]) -> None:
         """Take scenarios of equally many seconds."""
         self._parts = parts
-        sizes = [len(part.start) * part.cells.lanes.size for part in parts]
+        sizes = [len(part.start) * part.corridor.road.n_segments for part in parts]
         ends = np.cumsum([0, *sizes])
         self._places = [slice(*pair) for pair in itertools.pairwise(ends)]
         self.roads = _roads(parts)
@@ -214,12 +219,15 @@ class Batch:
         x = np.empty((len(age), N_CHANNELS), dtype=np.float32)
         for part, place in zip(self._parts, self._places, strict=True):
             k = len(part.start)
-            read(
-                part.cells, np.arange(k), part.observed[t], part.values[t], part.sigma[t],
-                part.centre[t], part.inputs[t], predicted[place].reshape(k, -1, 4),
-                age[place].reshape(k, -1), np.empty(part.sigma[t].shape),
-                x[place].reshape(k, -1, N_CHANNELS),
-            )  # fmt: skip
+            memory = Memory(
+                inputs=part.inputs[t],
+                present=predicted[place].reshape(k, -1, 4),
+                age=age[place].reshape(k, -1),
+                innovations=np.empty(part.sigma[t].shape),
+            )
+            measured = Measurement(part.observed[t], part.values[t], part.sigma[t], part.centre[t])
+            bundle = Bundle(part.corridor.road, part.channels, part.cells, memory)
+            read(bundle, np.arange(k), measured, x[place].reshape(k, -1, N_CHANNELS))
         return torch.from_numpy(x)
 
 
@@ -229,11 +237,11 @@ def _roads(parts: Sequence[Episodes]) -> Roads:
     first = n_episodes = 0
     for part in parts:
         cells, corridor, k = part.cells, part.corridor, len(part.start)
-        S = cells.lanes.size
-        unit.append(np.tile(cells.unit, k))
+        S = corridor.road.n_segments
+        unit.append(np.tile(cells.unit[:S], k))
         limit.append(np.full(k * S, cells.limit))
         offsets = first + S * np.arange(k)[:, None, None]
-        edges.append((cells.edges + offsets).reshape(-1, 2))
+        edges.append((corridor.road.edges + offsets).reshape(-1, 2))
         scales.append(np.tile([corridor.density_scale, corridor.speed_scale], (k * S, 1)))
         mainline.append(np.tile(np.arange(S) < corridor.n_mainline, k))
         episode.append(n_episodes + np.repeat(np.arange(k), S))

@@ -101,7 +101,7 @@ def start_from(shipped: ARZParameters, corridor: Corridor, name: str) -> ARZPara
 def is_stable(parameters: ARZParameters, corridor: Corridor) -> bool:
     """Return whether the CFL condition of a set holds on a road."""
     try:
-        ARZModel(corridor, parameters).require_time_step()
+        ARZModel(corridor.road, parameters).require_time_step()
     except ValueError:
         return False
     return True

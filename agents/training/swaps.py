@@ -131,7 +131,7 @@ def _tried(
     Returns columns of `Swaps`; ``n_before`` times as many states came before.
     """
     n, every = len(shown), np.arange(len(shown))
-    columns = before.release.task.n_columns
+    columns = before.release.task.n_channels
     noise = generator.choice([-1.0, 1.0], size=(n, columns, 2))
     reward, spent = _replayed(before, actions, noise)
     queried = np.zeros((n, before.interface.queries.n_options), dtype=bool)

@@ -56,10 +56,10 @@ def play(config: EnvConfig, worlds: AdjacentWorlds) -> Transcript:
     world_0, streams = np.zeros(1, dtype=np.int64), [np.random.default_rng(0)]
     for t, release in enumerate(overheard(config, worlds, world_0, plan, streams)):
         observed, values, sigma, centre = (part[0] for part in release.last)
-        length = release.task.length
+        length = release.task.channels.length
         for world, trip in enumerate(trips):
             segment, speed = trip.get(t + 1, (0, np.nan))
-            for c in np.flatnonzero(observed & (release.task.first == segment)):
+            for c in np.flatnonzero(observed & (release.task.channels.first == segment)):
                 price = (sigma[c, 0] * length[c]) ** -2
                 d = np.clip(speed - centre[segment], -clip, clip)
                 payment = price * (1.0 + ratio * (d / clip) ** 2)

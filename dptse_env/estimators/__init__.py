@@ -142,7 +142,7 @@ def with_demand(model: ARZModel, settings: Any) -> ARZModel:
     if has_demand == (model.n_demand_states > 0):
         return model
     return ARZModel(
-        model.network, model.parameters, model.time_step, model.reference_speed, model.rows,
+        model.road, model.parameters, model.time_step, model.reference_speed, model.channels,
         has_demand,
     )  # fmt: skip
 
@@ -248,7 +248,7 @@ def _check_attributes(estimator: Estimator, model: ARZModel, n_episodes: int) ->
     if missing is not None:
         raise ValueError(f"estimator {name} must {missing}")
     shapes = {
-        "innovations": (n_episodes, model.rows.n_rows, 2),
+        "innovations": (n_episodes, model.channels.size, 2),
         "diverged": (n_episodes,),
         "fallback": (n_episodes,),
     }

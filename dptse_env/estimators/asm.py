@@ -57,8 +57,10 @@ from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.settings import AdaptiveSmoothingSettings, EstimatorSettings
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
+from dptse_env.model.arrays import ARZ, Channels
 from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.model.step import pressure
+from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, all_finite, kernel, kernel_part
 
@@ -90,12 +92,6 @@ class Stencil(NamedTuple):
     delay: IntArray  # (Q,) f, whole steps that the wave takes to arrive
     weight: FloatArray  # (Q, 2, 3) factors of P_t, the sum and P_{t-f-1}; and for squared weights
     first: IntArray  # (J + 1,) where the entries of each place begin
-    lanes: FloatArray  # (S,)
-    jam: FloatArray  # (S,) largest densities [veh/km]
-    lengths: FloatArray  # (S,) [km]
-    limits: FloatArray  # (S,) speed limits [km/h]
-    row_first: IntArray  # (M,) first segment of each row of a measurement
-    row_span: IntArray  # (M,) segments of each row
     flows: bool  # whether flows are released, otherwise speeds
     decay: float  # r
     threshold: float  # V
@@ -103,23 +99,7 @@ class Stencil(NamedTuple):
     largest_speed: float
     step: float  # [s]
     forgetting: float  # of the factors in a step
-
-
-class Ends(NamedTuple):
-    """The ends of the road, and what the model's inputs say of them."""
-
-    entries: IntArray  # (1 + I,) segments
-    entry_inputs: IntArray  # (1 + I,) columns of the demands, before those of w
-    entry_jam: FloatArray  # (1 + I,) jam densities outside [veh/km]
-    entry_lanes: FloatArray  # (1 + I,)
-    exits: IntArray  # (1 + O,) segments
-    exit_inputs: IntArray  # (1 + O,) columns of the densities
-    exit_jam: FloatArray  # (1 + O,)
-    exit_lanes: FloatArray  # (1 + O,)
-    jam: FloatArray  # (S,) jam densities [veh/km]
-    free_flow_speed: float
-    gamma: float
-    weight: float
+    boundary_weight: float  # of what the model's inputs say of the ends
 
 
 class State(NamedTuple):
@@ -170,7 +150,7 @@ class AdaptiveSmoothing(BatchEstimator):
         scale = np.array([model.density_scale, model.speed_scale])
         self._prior[..., 2:] = np.sqrt(settings.initial_variance) * scale
         self.state.present[:] = self._prior
-        self._bundle = Bundle(stencil, make_ends(model, settings.asm), self.state)
+        self._bundle = Bundle(model.road, model.arz, model.channels, stencil, self.state)
 
     @property
     def means(self) -> FloatArray:
@@ -191,8 +171,7 @@ class AdaptiveSmoothing(BatchEstimator):
         predict(self._bundle, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        observed, values, sigma, centre = measured
-        update(self._bundle, episodes, observed, values, sigma, centre)
+        update(self._bundle, episodes, measured)
         lost = episodes[self.diverged[episodes]]
         if lost.size > 0:
             self._restart(lost)
@@ -203,7 +182,7 @@ class AdaptiveSmoothing(BatchEstimator):
 
 def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stencil:
     """Return what the values of each place count for."""
-    layout, step = model.layout, model.time_step
+    step = model.time_step
     lines: list[tuple[int, int, int, list[list[float]]]] = []
     first = [0]
     for reached in neighbours(model, REACH * settings.length):
@@ -229,12 +208,6 @@ def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stenci
         delay=delay,
         weight=np.array([line[3] for line in lines]),
         first=np.array(first, dtype=np.int64),
-        lanes=layout.lanes,
-        jam=model.jam_density,
-        lengths=layout.lengths,
-        limits=np.array(model.network.speed_limits),
-        row_first=model.rows.first,
-        row_span=model.rows.span,
         flows=model.reference_speed is not None,
         decay=math.exp(-step / settings.time),
         threshold=float(settings.threshold),
@@ -242,6 +215,7 @@ def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stenci
         largest_speed=float(model.largest_speed),
         step=float(step),
         forgetting=math.exp(-step / MEMORY),
+        boundary_weight=float(settings.boundary_weight),
     )
 
 
@@ -269,46 +243,25 @@ def neighbours(model: ARZModel, reach: float) -> Iterator[dict[int, float]]:
     Yields:
         Distances [km] of segments by index: positive downstream.
     """
-    layout, network = model.layout, model.network
-    n = network.n_mainline
-    chains = [list(range(n)), *network.on_ramp_segments, *network.off_ramp_segments]
-    chain_of = {s: list(chain) for chain in chains for s in chain}
-    centre: dict[int, float] = {}
-    for chain in chains:
-        ends = np.cumsum(layout.lengths[list(chain)])
-        middles = (ends - 0.5 * layout.lengths[list(chain)]).tolist()
-        centre |= dict(zip(chain, middles, strict=True))
-    places = [(s, centre[s]) for s in range(layout.n_segments)]
-    places += [(s, centre[s] - layout.lengths[s]) for s in layout.entries.tolist()]
-    places += [(s, centre[s] + layout.lengths[s]) for s in layout.exits.tolist()]
+    road = model.road
+    centre, stretches = np.empty(road.n_segments), {}
+    for stretch in np.unique(road.stretch).tolist():
+        segments = np.flatnonzero(road.stretch == stretch)
+        lengths = road.lengths[segments]
+        centre[segments] = np.cumsum(lengths) - 0.5 * lengths
+        stretches[stretch] = segments.tolist()
+    places = [(s, centre[s]) for s in range(road.n_segments)]
+    places += [(s, centre[s] - road.lengths[s]) for s in road.entries.tolist()]
+    places += [(s, centre[s] + road.lengths[s]) for s in road.exits.tolist()]
     for segment, x in places:
-        distances = {s: centre[s] - x for s in chain_of[segment]}
+        distances = {s: float(centre[s] - x) for s in stretches[int(road.stretch[segment])]}
         yield {s: d for s, d in distances.items() if abs(d) <= reach}
-
-
-def make_ends(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Ends:
-    """Return the ends of a model's road."""
-    layout, parameters = model.layout, model.parameters
-    return Ends(
-        entries=layout.entries,
-        entry_inputs=layout.entry_inputs,
-        entry_jam=model.entry_jam_density,
-        entry_lanes=layout.entry_lanes,
-        exits=layout.exits,
-        exit_inputs=layout.exit_inputs,
-        exit_jam=model.exit_jam_density,
-        exit_lanes=layout.exit_lanes,
-        jam=model.jam_density,
-        free_flow_speed=float(parameters.free_flow_speed),
-        gamma=float(parameters.gamma),
-        weight=float(settings.boundary_weight),
-    )
 
 
 @kernel
 def restart(bundle: Bundle, episodes: IntArray, prior: FloatArray) -> None:
     """Begin episodes `(k,)` with their prior `(n, S, 4)` as the values of a second."""
-    stencil, _, state = bundle.parts
+    road, _, _, _, state = bundle.parts
     for k in range(episodes.size):
         e = episodes[k]
         past = state.past[e]
@@ -317,8 +270,8 @@ def restart(bundle: Bundle, episodes: IntArray, prior: FloatArray) -> None:
         state.evidence[e] = CONFIDENCE
         state.age[e] = 0.0
         state.innovations[e] = 0.0
-        for s in range(stencil.lanes.size):
-            lanes, known = stencil.lanes[s], past[s, 0]
+        for s in range(road.n_segments):
+            lanes, known = road.lanes[s], past[s, 0]
             known[WEIGHT] = 1.0
             known[DENSITY], known[SPEED] = prior[e, s, 0] / lanes, prior[e, s, 1]
             known[DENSITY_NOISE] = (prior[e, s, 2] / lanes) ** 2
@@ -331,7 +284,7 @@ def restart(bundle: Bundle, episodes: IntArray, prior: FloatArray) -> None:
 @kernel
 def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Let values age by a step, and add what inputs `(k, n_u)` say of the ends."""
-    stencil, ends, state = bundle.parts
+    road, arz, _, stencil, state = bundle.parts
     for k in range(episodes.size):
         e = episodes[k]
         past, present = state.past[e], state.present[e]
@@ -346,9 +299,9 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
                 new[c] = r * old[c]
             for c in range(DENSITY_NOISE, 5):
                 new[c] = r * r * old[c]
-        if ends.weight > 0.0:
-            _read_ends(ends, inputs[k], present, past, place, stencil.lanes)
-        for s in range(stencil.lanes.size):
+        if stencil.boundary_weight > 0.0:
+            _read_ends(road, arz, stencil, inputs[k], present, past, place)
+        for s in range(road.n_segments):
             state.age[e, s] += stencil.step
             for i in range(2):
                 for j in range(2):
@@ -356,35 +309,37 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
                     kept = state.evidence[e, s, i, j] - CONFIDENCE
                     state.evidence[e, s, i, j] = CONFIDENCE + stencil.forgetting * kept
         _sum(stencil, past, place, state.sums[e])
-        _evaluate(stencil, state, e)
+        _evaluate(road, arz, stencil, state, e)
 
 
 @kernel_part
 def _read_ends(
-    ends: Ends,
+    road: Road,
+    arz: ARZ,
+    stencil: Stencil,
     inputs: FloatArray,
     present: FloatArray,
     past: FloatArray,
     place: int,
-    lanes: FloatArray,
 ) -> None:
     """Add the values of the ends."""
-    v_f, gamma, weight, S = ends.free_flow_speed, ends.gamma, ends.weight, lanes.size
-    for b in range(ends.entries.size):
-        column = ends.entry_inputs[b]
+    v_f, gamma, weight = arz.free_flow_speed, arz.gamma, stencil.boundary_weight
+    S, jam = road.n_segments, arz.jam
+    for b in range(road.entries.size):
+        column, cell = road.entry_inputs[b], road.entry_cells[b]
         w = inputs[column + 1]
-        rho = entry_density(inputs[column], w, v_f, gamma, ends.entry_jam[b])
+        rho = entry_density(inputs[column], w, v_f, gamma, jam[cell])
         new = past[S + b, place]
         new[WEIGHT] += weight
-        new[DENSITY] += weight * rho / ends.entry_lanes[b]
-        new[SPEED] += weight * (w - pressure(rho, ends.entry_jam[b], v_f, gamma))
-    for b in range(ends.exits.size):
-        s, rho = ends.exits[b], inputs[ends.exit_inputs[b]]
-        w = present[s, 1] + pressure(present[s, 0], ends.jam[s], v_f, gamma)
-        new = past[S + ends.entries.size + b, place]
+        new[DENSITY] += weight * rho / road.lanes[cell]
+        new[SPEED] += weight * (w - pressure(rho, jam[cell], v_f, gamma))
+    for b in range(road.exits.size):
+        s, cell, rho = road.exits[b], road.exit_cells[b], inputs[road.exit_inputs[b]]
+        w = present[s, 1] + pressure(present[s, 0], jam[s], v_f, gamma)
+        new = past[S + road.entries.size + b, place]
         new[WEIGHT] += weight
-        new[DENSITY] += weight * rho / ends.exit_lanes[b]
-        new[SPEED] += weight * max(w - pressure(rho, ends.exit_jam[b], v_f, gamma), 0.0)
+        new[DENSITY] += weight * rho / road.lanes[cell]
+        new[SPEED] += weight * max(w - pressure(rho, jam[cell], v_f, gamma), 0.0)
 
 
 @kernel_part
@@ -438,11 +393,11 @@ def _sum(stencil: Stencil, past: FloatArray, place: int, sums: FloatArray) -> No
 
 
 @kernel_part
-def _evaluate(stencil: Stencil, state: State, e: int) -> None:
+def _evaluate(road: Road, arz: ARZ, stencil: Stencil, state: State, e: int) -> None:
     """Write the estimates of an episode, and their deviations."""
     sums, present, smoothed = state.sums[e], state.present[e], state.smoothed[e]
-    for s in range(stencil.lanes.size):
-        free, jam, lanes = sums[s, FREE], sums[s, JAM], stencil.lanes[s]
+    for s in range(road.n_segments):
+        free, jam, lanes = sums[s, FREE], sums[s, JAM], road.lanes[s]
         by_free, by_jam = 1.0 / free[WEIGHT], 1.0 / jam[WEIGHT]
         v_free, v_jam = by_free * free[SPEED], by_jam * jam[SPEED]
         m = stencil.threshold - min(v_free, v_jam)
@@ -450,9 +405,9 @@ def _evaluate(stencil: Stencil, state: State, e: int) -> None:
         by_free, by_jam = (1.0 - m) * by_free, m * by_jam
         rho = lanes * (by_free * free[DENSITY] + by_jam * jam[DENSITY])
         gap = lanes * (jam[DENSITY] / jam[WEIGHT] - free[DENSITY] / free[WEIGHT])
-        present[s, 0] = rho = min(max(rho, 0.0), stencil.jam[s])
+        present[s, 0] = rho = min(max(rho, 0.0), arz.jam[s])
         present[s, 1] = min(max(m * v_jam + (1.0 - m) * v_free, 0.0), stencil.largest_speed)
-        length = stencil.lengths[s]
+        length = road.lengths[s]
         vehicles = rho * length
         flicker = DENSITY_MODEL[0] * math.sqrt(vehicles) / length**2
         smoothed[s, 0] = flicker + DENSITY_MODEL[1] * gap**2
@@ -477,77 +432,65 @@ def _factor(evidence: FloatArray) -> float:
 
 
 @kernel
-def update(
-    bundle: Bundle,
-    episodes: IntArray,
-    observed: BoolArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-) -> None:
-    """Add what was released to the sums, and evaluate them; the arguments are a `Measurement`'s."""
-    stencil, _, state = bundle.parts
-    value = np.empty(5)
-    added = np.empty((stencil.lanes.size, 5))
+def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
+    """Add what was released of episodes `(k,)` to the sums, and evaluate them."""
+    road, arz, channels, stencil, state = bundle.parts
+    added = np.empty((road.n_segments, 5))
     for k in range(episodes.size):
         e = episodes[k]
         state.innovations[e] = 0.0
         added[:] = 0.0
-        for m in range(stencil.row_first.size):
-            if observed[k, m]:
-                _read_row(stencil, state, e, m, values[k, m], sigma[k, m], centre[k], value)
-                for s in range(stencil.row_first[m], stencil.row_first[m] + stencil.row_span[m]):
+        for m in range(channels.first.size):
+            if measured.observed[k, m]:
+                value = _read_channel(road, channels, stencil, state, e, m, measured, k)
+                for s in range(channels.first[m], channels.first[m] + channels.span[m]):
                     for c in range(5):
                         added[s, c] += value[c]
-        for s in range(stencil.lanes.size):
+        for s in range(road.n_segments):
             if added[s, WEIGHT] > 0.0:
                 _add(stencil, state, e, s, added[s])
         # Estimates are clipped, so that they do not show it.
         state.diverged[e] = not all_finite(state.sums[e].reshape(-1))
-        _evaluate(stencil, state, e)
+        _evaluate(road, arz, stencil, state, e)
 
 
 @kernel_part
-def _read_row(
+def _read_channel(
+    road: Road,
+    channels: Channels,
     stencil: Stencil,
     state: State,
     e: int,
     m: int,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write a row's innovations, what they say of the factors, and its value for each segment.
+    measured: Measurement,
+    k: int,
+) -> tuple[float, float, float, float, float]:
+    """Write a channel's innovations and what they say of the factors; return its value.
 
-    Each segment has the average of the row, with a weight and a variance as if the segments' were
-    independent values.
+    Each of its segments has its average, with a weight and a variance as if they were independent
+    values.
     """
-    first, span = stencil.row_first[m], stencil.row_span[m]
+    values, sigma, centre = measured.values[k, m], measured.sigma[k, m], measured.centre[k]
+    first, span = channels.first[m], channels.span[m]
     present, share = state.present[e], 1.0 / span
     lanes, rho, rho_variance, rho_smoothed = 0.0, 0.0, 0.0, 0.0
     y, y_variance, y_smoothed, carried, least = 0.0, 0.0, 0.0, 0.0, 0.0
     for s in range(first, first + span):
         density, speed = present[s, 0], present[s, 1]
-        lanes += share * stencil.lanes[s]
+        lanes += share * road.lanes[s]
         rho += share * density
         rho_variance += (share * present[s, 2]) ** 2
         rho_smoothed += share**2 * state.smoothed[e, s, 0]
-        floored = max(density, LEAST_DENSITY * stencil.lanes[s])
+        floored = max(density, LEAST_DENSITY * road.lanes[s])
         by_speed, slip = 1.0, 0.0
         if stencil.flows:
             by_speed, slip = floored, speed - centre[s]
-            carried += share * (density * centre[s] + (floored - density) * stencil.limits[s])
+            carried += share * (density * centre[s] + (floored - density) * road.limits[s])
         y += share * (density * slip if stencil.flows else speed)
         y_variance += share**2 * ((by_speed * present[s, 3]) ** 2 + (slip * present[s, 2]) ** 2)
         y_smoothed += share**2 * by_speed**2 * state.smoothed[e, s, 1]
         least += share * floored
     by_flow = 1.0 / least if stencil.flows else 1.0
-    out[WEIGHT] = share
-    out[DENSITY] = share * values[0] / lanes
-    out[SPEED] = share * by_flow * (values[1] + carried)
-    out[DENSITY_NOISE] = share * (sigma[0] / lanes) ** 2
-    out[SPEED_NOISE] = share * (by_flow * sigma[1]) ** 2
     for i in range(2):
         error = values[0] - rho if i == 0 else values[1] - y
         noise = sigma[i] ** 2
@@ -562,6 +505,13 @@ def _read_row(
             gain = smoothed / (known + smoothed) ** 2
             evidence[0] += gain * (error**2 - known)
             evidence[1] += gain * smoothed
+    return (
+        share,
+        share * values[0] / lanes,
+        share * by_flow * (values[1] + carried),
+        share * (sigma[0] / lanes) ** 2,
+        share * (by_flow * sigma[1]) ** 2,
+    )
 
 
 @kernel_part

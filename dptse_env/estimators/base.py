@@ -48,7 +48,7 @@ class Estimate(NamedTuple):
 class Measurement(NamedTuple):
     """A second of k episodes as it was released, on its way from the mechanism to the estimator.
 
-    Its C columns are the M rows of ``model.rows``, then the R boundary segments where these are
+    Its C channels are the M of ``model.channels``, then the R boundary segments where these are
     released; estimators read the first M.
 
     Attributes:
@@ -74,10 +74,10 @@ class Measurement(NamedTuple):
         sigma: FloatArray,
         centre: FloatArray | None = None,
     ) -> Measurement:
-        """Return a measurement of the rows of a road, for callers outside of the process.
+        """Return a measurement of the channels of a model, for callers outside of the process.
 
         Args:
-            model: The road and its rows.
+            model: The road and what is measured of it.
             observed: Shape (k, M).
             values: Shape (k, M, 2).
             sigma: Shape (k, M, 2), or one that broadcasts to it.
@@ -88,8 +88,9 @@ class Measurement(NamedTuple):
             ValueError: A shape is another, or a deviation or centre is negative or not finite.
         """
         seen = np.ascontiguousarray(observed, dtype=np.bool_)
-        if seen.ndim != 2 or seen.shape[1] != model.rows.n_rows:
-            raise ValueError(f"observed must have shape (k, {model.rows.n_rows}), got {seen.shape}")
+        if seen.ndim != 2 or seen.shape[1] != model.channels.size:
+            shape = f"(k, {model.channels.size})"
+            raise ValueError(f"observed must have shape {shape}, got {seen.shape}")
         given = np.ascontiguousarray(values, dtype=np.float64)
         if given.shape != (*seen.shape, 2):
             raise ValueError(f"values must have shape {(*seen.shape, 2)}, got {given.shape}")
@@ -197,9 +198,8 @@ class BatchEstimator(ABC):
         scale = np.array(getattr(settings, "noise_scale", (1.0, 1.0)))
         self._noise_scale = None if (scale == 1.0).all() else scale
         cap = getattr(settings, "speed_cap", None)
-        self._largest_speed = None if cap is None else cap * np.array(model.network.speed_limits)
-        self._n_rows = model.rows.n_rows
-        self.innovations = np.zeros((n_episodes, self._n_rows, 2))
+        self._largest_speed = None if cap is None else cap * model.road.limits[: model.n_segments]
+        self.innovations = np.zeros((n_episodes, model.channels.size, 2))
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
         self.fallback = np.zeros(n_episodes, dtype=np.bool_)
 
@@ -227,7 +227,7 @@ class BatchEstimator(ABC):
 
     def update(self, episodes: IntArray, measured: Measurement) -> None:
         """See `Estimator.update`; observed values that are not finite make a filter diverge."""
-        own = measured.on_road(self._n_rows, self.model.n_segments)
+        own = measured.on_road(self.model.channels.size, self.model.n_segments)
         if self._noise_scale is not None:
             observed, values, sigma, centre = own
             own = Measurement(observed, values, self._noise_scale * sigma, centre)

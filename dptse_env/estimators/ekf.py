@@ -14,18 +14,19 @@ from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.linalg import is_covariance, mirror, padded, pair_update, propagate
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.network import RoadArrays
+from dptse_env.model.arrays import ARZ, Channels
 from dptse_env.model.parameters import LARGEST_W, VACUUM
 from dptse_env.model.step import (
     advance,
     clip,
+    floored_speed,
     make_scratch,
-    measured,
     normalise,
     pressure,
     project,
-    write_row,
+    write_channel,
 )
+from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import (
     Bundle,
@@ -81,7 +82,7 @@ class CovarianceFilter(BatchEstimator):
             count_variance=count_variance(model, settings),
             is_box=settings.bounds == "box",
         )
-        self._bundle = Bundle(model.road, self.filters)
+        self._bundle = Bundle(*model.dynamics, self.filters)
         for episode in range(n_episodes):
             restart(self.filters, episode)
 
@@ -116,7 +117,7 @@ class CovarianceFilter(BatchEstimator):
 class EKF(CovarianceFilter):
     """Extended Kalman filter on the ARZ model: analytic Jacobians, sequential Joseph updates.
 
-    All rows of a step are linearised at its prediction, so that updating by one after the other
+    All channels of a step are linearised at its prediction, so that updating by one after the other
     equals the joint update by all, in whichever order. Means are projected after predict and
     update; covariances are not.
     """
@@ -125,14 +126,13 @@ class EKF(CovarianceFilter):
         predict(self._bundle, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        observed, values, sigma, centre = measured
-        update(self._bundle, episodes, observed, values, sigma, centre)
+        update(self._bundle, episodes, measured)
 
 
-class Rows(NamedTuple):
-    """Rows of a measurement, linearised at a prediction and normalised."""
+class Linearised(NamedTuple):
+    """Channels of a measurement, linearised at a prediction and normalised."""
 
-    weights: FloatArray  # (M, 2, 2 x largest span) of the components from 2 `row_first` on
+    weights: FloatArray  # (M, 2, 2 x largest span) of the components from 2 `first` on
     residuals: FloatArray  # (M, 2)
     noise: FloatArray  # (M, 2) variances
 
@@ -140,58 +140,49 @@ class Rows(NamedTuple):
 @kernel
 def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
-    road, filters = bundle.parts
+    road, arz, _, filters = bundle.parts
     scratch, noise = make_scratch(road), np.empty(filters.units.size)
     blocks = np.empty((*road.neighbours.shape, 4))
     work = np.empty((2, *filters.covariances.shape[1:]))
     for k in range(episodes.size):
         mean, covariance = filters.means[episodes[k]], filters.covariances[episodes[k]]
         process_noise(road, filters, mean, noise)
-        advance(road, mean, inputs[k], mean, blocks, scratch)
-        project(road, mean, filters.is_box)
-        normalise(road, filters.units[0], blocks, scratch.by_factor)
+        advance(road, arz, mean, inputs[k], mean, blocks, scratch)
+        project(road, arz, mean, filters.is_box)
+        normalise(arz, filters.units[0], blocks, scratch.by_factor)
         mirror(covariance)
         propagate(road, blocks, scratch.by_factor, noise, covariance, work, covariance)
 
 
 @kernel_part
-def process_noise(
-    road: RoadArrays, filters: Filters, mean: FloatArray, variance: FloatArray
-) -> None:
+def process_noise(road: Road, filters: Filters, mean: FloatArray, variance: FloatArray) -> None:
     """Write the variances `(n_x,)` of the process noise of a step that leaves a mean `(n_x,)`."""
     copy_vector(filters.process_variance, variance)
-    for s in range(road.jam.size):
+    for s in range(road.n_segments):
         variance[2 * s] += filters.growth_variance * mean[2 * s] / filters.units[2 * s]
 
 
 @kernel
-def update(
-    bundle: Bundle,
-    episodes: IntArray,
-    observed: BoolArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-) -> None:
+def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
     """Update by measurements; see `Estimator.update`."""
-    road, filters = bundle.parts
-    n_rows, width, longest = road.row_first.size, filters.covariances.shape[2], 1
-    for m in range(n_rows):
-        longest = max(longest, road.row_span[m])
-    weights = np.empty((n_rows, 2, 2 * longest))
-    rows = Rows(weights, np.empty((n_rows, 2)), np.empty((n_rows, 2)))
+    road, arz, channels, filters = bundle.parts
+    n_channels, width, longest = channels.first.size, filters.covariances.shape[2], 1
+    for m in range(n_channels):
+        longest = max(longest, channels.span[m])
+    weights = np.empty((n_channels, 2, 2 * longest))
+    linear = Linearised(weights, np.empty((n_channels, 2)), np.empty((n_channels, 2)))
     shift, work = np.empty(width), np.empty((4, width))
     for k in range(episodes.size):
-        e = episodes[k]
+        e, observed = episodes[k], measured.observed[k]
         mean, covariance = filters.means[e], filters.covariances[e]
-        _linearise(road, filters, e, observed[k], values[k], sigma[k], centre[k], rows)
-        _innovate(road, filters, e, observed[k], rows)
+        _linearise(arz, channels, filters, e, measured, k, linear)
+        _innovate(channels, filters, e, observed, linear)
         sound = True
-        if any_of(observed[k]):
-            sound = _assimilate(road, covariance, observed[k], rows, shift, work)
+        if any_of(observed):
+            sound = _assimilate(channels, covariance, observed, linear, shift, work)
             for i in range(mean.size):
                 mean[i] += shift[i] * filters.units[i]
-            project(road, mean, filters.is_box)
+            project(road, arz, mean, filters.is_box)
         filters.diverged[e] = not (sound and all_finite(mean) and is_covariance(covariance, shift))
         if filters.diverged[e]:
             restart(filters, e)
@@ -199,75 +190,77 @@ def update(
 
 @kernel_part
 def _linearise(
-    road: RoadArrays,
+    arz: ARZ,
+    channels: Channels,
     filters: Filters,
     e: int,
-    observed: BoolArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-    rows: Rows,
+    measured: Measurement,
+    k: int,
+    linear: Linearised,
 ) -> None:
-    """Write the weights, residuals and noise of the observed rows at an episode's mean."""
-    mean, units = filters.means[e], filters.units
-    for m in range(road.row_first.size):
-        if not observed[m]:
+    """Write the weights, residuals and noise of what is observed at an episode's mean."""
+    mean, units, centre = filters.means[e], filters.units, measured.centre[k]
+    values, sigma = measured.values[k], measured.sigma[k]
+    for m in range(channels.first.size):
+        if not measured.observed[k, m]:
             continue
-        weights, residuals = rows.weights[m], rows.residuals[m]
-        first, span = 2 * road.row_first[m], road.row_span[m]
-        write_row(road, units, mean, centre, m, weights, residuals)
+        weights, residuals = linear.weights[m], linear.residuals[m]
+        first, span = 2 * channels.first[m], channels.span[m]
+        write_channel(arz, channels, units, mean, centre, m, weights, residuals)
         density = 0.0
         for i in range(2 * span):
             x = mean[first + i] / units[first + i]
             density += weights[0, i] * x
             residuals[1] += weights[1, i] * x
         residuals[0] = values[m, 0] / units[0] - density
-        residuals[1] = values[m, 1] / road.second_scale - residuals[1]
-        rows.noise[m, 0] = (sigma[m, 0] / units[0]) ** 2
-        rows.noise[m, 0] += filters.count_variance[m] * density * units[0] / span
-        rows.noise[m, 1] = (sigma[m, 1] / road.second_scale) ** 2
+        residuals[1] = values[m, 1] / arz.second_scale - residuals[1]
+        linear.noise[m, 0] = (sigma[m, 0] / units[0]) ** 2
+        linear.noise[m, 0] += filters.count_variance[m] * density * units[0] / span
+        linear.noise[m, 1] = (sigma[m, 1] / arz.second_scale) ** 2
 
 
 @kernel_part
-def _innovate(road: RoadArrays, filters: Filters, e: int, observed: BoolArray, rows: Rows) -> None:
+def _innovate(
+    channels: Channels, filters: Filters, e: int, observed: BoolArray, linear: Linearised
+) -> None:
     """Write residuals over their predicted deviations."""
     covariance, innovations = filters.covariances[e], filters.innovations[e]
     for m in range(observed.size):
         fill_vector(innovations[m], 0.0)
         if not observed[m]:
             continue
-        first, size = 2 * road.row_first[m], 2 * road.row_span[m]
+        first, size = 2 * channels.first[m], 2 * channels.span[m]
         for q in range(2):
-            variance = rows.noise[m, q]
+            variance = linear.noise[m, q]
             for i in range(size):
-                along = 0.5 * rows.weights[m, q, i] * covariance[first + i, first + i]
+                along = 0.5 * linear.weights[m, q, i] * covariance[first + i, first + i]
                 for j in range(i):
-                    along += rows.weights[m, q, j] * covariance[first + i, first + j]
-                variance += 2.0 * rows.weights[m, q, i] * along
-            innovations[m, q] = rows.residuals[m, q] / np.sqrt(variance)
+                    along += linear.weights[m, q, j] * covariance[first + i, first + j]
+                variance += 2.0 * linear.weights[m, q, i] * along
+            innovations[m, q] = linear.residuals[m, q] / np.sqrt(variance)
 
 
 @kernel_part
-def rows_seen(observed: BoolArray, rows: IntArray) -> IntArray:
-    """Return the indices of observed rows, which are written to the beginning of `rows` `(M,)`."""
+def find_observed(observed: BoolArray, indices: IntArray) -> IntArray:
+    """Return the channels that are observed, which are written to the start of `indices` `(M,)`."""
     n_seen = 0
-    for m in range(rows.size):
+    for m in range(indices.size):
         if observed[m]:
-            rows[n_seen] = m
+            indices[n_seen] = m
             n_seen += 1
-    return rows[:n_seen]
+    return indices[:n_seen]
 
 
 @kernel_part(fastmath={"contract"})
 def _assimilate(
-    road: RoadArrays,
+    channels: Channels,
     covariance: FloatArray,
     observed: BoolArray,
-    rows: Rows,
+    linear: Linearised,
     shift: FloatArray,
     work: FloatArray,
 ) -> bool:
-    """Update a covariance by the observed rows, and write the normalised change of the mean.
+    """Update a covariance by what is observed, and write the normalised change of the mean.
 
     Returns:
         Whether all variances of the measured numbers are sound.
@@ -276,12 +269,12 @@ def _assimilate(
     for m in range(observed.size):
         if not observed[m]:
             continue
-        first, size = 2 * road.row_first[m], 2 * road.row_span[m]
-        weights = rows.weights[m, :, :size]
-        if not pair_update(covariance, first, weights, rows.noise[m], work):
+        first, size = 2 * channels.first[m], 2 * channels.span[m]
+        weights = linear.weights[m, :, :size]
+        if not pair_update(covariance, first, weights, linear.noise[m], work):
             return False
         for q in range(2):
-            residual = rows.residuals[m, q]
+            residual = linear.residuals[m, q]
             for i in range(size):
                 residual -= weights[q, i] * shift[first + i]
             for j in range(shift.size):
@@ -304,15 +297,15 @@ def restart(filters: Filters, episode: int) -> None:
 @kernel
 def summarise(bundle: Bundle, out: FloatArray) -> None:
     """Write density, speed and their standard deviations to `out` `(4, n, S)`, physical units."""
-    road, filters = bundle.parts
-    v_f, gamma = road.free_flow_speed, road.gamma
+    road, arz, _, filters = bundle.parts
+    v_f, gamma = arz.free_flow_speed, arz.gamma
     for e in range(filters.means.shape[0]):
         covariance = filters.covariances[e]
-        for s in range(road.jam.size):
-            i, j, jam = 2 * s, 2 * s + 1, road.jam[s]
+        for s in range(road.n_segments):
+            i, j, jam = 2 * s, 2 * s + 1, arz.jam[s]
             rho, psi = filters.means[e, i], filters.means[e, j]
             w = psi / rho if rho > VACUUM * jam else v_f
-            _, by_rho, by_psi = measured(rho, psi, jam, v_f, gamma)
+            _, by_rho, by_psi = floored_speed(rho, psi, jam, v_f, gamma)
             a, b = by_rho * filters.units[i], by_psi * filters.units[j]
             variance = a * (a * covariance[i, i] + 2.0 * b * covariance[j, i])
             variance += b * b * covariance[j, j]
@@ -342,8 +335,8 @@ def initial_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray
 def count_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
     """Return the variances of measured densities beside the noise, over rho [km/veh], shape (M,).
 
-    They are those of a row's first segment; a row of several segments has so many times less.
+    They are those of a channel's first segment; one of several segments has so many times less.
     """
-    lengths = model.layout.lengths[model.rows.first]
+    lengths = model.road.lengths[model.channels.first]
     variance: FloatArray = settings.count_noise / lengths / model.density_scale**2
     return variance

@@ -15,23 +15,24 @@ from numpy.typing import NDArray
 from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.ekf import (
     count_variance,
+    find_observed,
     initial_variance,
     process_variance,
-    rows_seen,
 )
 from dptse_env.estimators.linalg import factor, padded, solve_many
 from dptse_env.estimators.normals import STREAM_WIDTH, Draws, draw, make_stream
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
+from dptse_env.model.arrays import ARZ
 from dptse_env.model.columns import (
     advance_states,
     make_batch_scratch,
-    measure_row,
+    measure_channel,
     measured_speeds,
     project_states,
 )
-from dptse_env.model.network import RoadArrays, RoadNetwork
 from dptse_env.model.parameters import LARGEST_W
+from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
 
@@ -53,8 +54,8 @@ class Ensembles(NamedTuple):
     initial_deviation: FloatArray  # (n_x,) of the members around a prior [veh/km, veh/h, 1]
     density_scale: float  # rho_m [veh/km]
     inflation: float  # factor on distances from the mean before an update
-    tapers: FloatArray  # (M, n_x) weights of covariances of rows with states; (0, 0) for none
-    row_tapers: FloatArray  # (M, M) weights of covariances among rows; (0, 0) for none
+    tapers: FloatArray  # (M, n_x) weights of covariances of channels with states; (0, 0) for none
+    channel_tapers: FloatArray  # (M, M) weights of covariances among channels; (0, 0) for none
     is_box: bool  # whether members are projected into the paper's box, not the cone
 
 
@@ -99,10 +100,10 @@ class EnKF(BatchEstimator):
             density_scale=model.density_scale,
             inflation=settings.enkf.inflation,
             tapers=weights.with_states,
-            row_tapers=weights.among_rows,
+            channel_tapers=weights.among_channels,
             is_box=settings.bounds == "box",
         )
-        self._bundle = Bundle(model.road, self._ensembles)
+        self._bundle = Bundle(*model.dynamics, self._ensembles)
         self._seed(np.arange(n_episodes), [np.random.default_rng(0)] * n_episodes)
 
     @property
@@ -145,8 +146,7 @@ class EnKF(BatchEstimator):
         predict(self._bundle, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        observed, values, sigma, centre = measured
-        update(self._bundle, episodes, observed, values, sigma, centre)
+        update(self._bundle, episodes, measured)
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
@@ -158,46 +158,28 @@ class EnKF(BatchEstimator):
 
 
 class Tapers(NamedTuple):
-    """Weights of the covariances of M rows of a measurement."""
+    """Weights of the covariances of M channels."""
 
     with_states: FloatArray  # (M, n_x) with the components of the state
-    among_rows: FloatArray  # (M, M)
+    among_channels: FloatArray  # (M, M)
 
 
 def make_tapers(model: ARZModel, reach: float) -> Tapers:
-    """Return weights for the rows of a model's measurements, zero beyond a reach [km].
+    """Return weights for the channels of a model, zero beyond a reach [km].
 
-    A row over several segments has the average weight of its segments, and a demand factor lies
-    where its entry does. With T the weights between segments, W those of the segments in the rows
-    and C the choice of a segment for each component, all weights are blocks of `[C; W] T [C; W]'`.
+    A channel over several segments has the average weight of its segments, and a demand factor lies
+    where its entry does. With T the weights between segments, W those of the segments in the
+    channels and C the choice of a segment for each component, all weights are blocks of
+    `[C; W] T [C; W]'`.
     Every segment has a position on a line, where the function is a correlation: T is positive
     semidefinite, hence the blocks, and so is their element-wise product with a covariance (Schur).
     Distances that include the ramps would not guarantee that.
     """
-    x, weights = positions(model.network), model.rows.weights
+    x, weights = model.road.position, model.averaging
     by_segment = weights @ gaspari_cohn(np.abs(x[:, None] - x), reach)
-    entries = model.layout.entries[: model.n_demand_states]
+    entries = model.road.entries[: model.n_demand_states]
     segments = np.concatenate([np.repeat(np.arange(model.n_segments), 2), entries])
     return Tapers(np.ascontiguousarray(by_segment[:, segments]), by_segment @ weights.T)
-
-
-def positions(network: RoadNetwork) -> FloatArray:
-    """Return the positions of segments along the road `(S,)` [km], from its upstream end.
-
-    Mainline segments lie at their centres, ramps at the face where they join or leave.
-    """
-    lengths = np.array(network.segment_lengths)
-    faces = np.concatenate([[0.0], np.cumsum(lengths[: network.n_mainline])])
-    along = np.empty(lengths.size)
-    along[: network.n_mainline] = 0.5 * (faces[:-1] + faces[1:])
-    ramps = zip(
-        (*network.on_ramps, *network.off_ramps),
-        (*network.on_ramp_segments, *network.off_ramp_segments),
-        strict=True,
-    )
-    for face, segments in ramps:
-        along[list(segments)] = faces[face]
-    return along
 
 
 def gaspari_cohn(distance: FloatArray, reach: float) -> FloatArray:
@@ -220,19 +202,19 @@ def gaspari_cohn(distance: FloatArray, reach: float) -> FloatArray:
 @kernel
 def restart(bundle: Bundle, episodes: IntArray) -> None:
     """Draw the members of episodes around their priors."""
-    road, ensembles = bundle.parts
+    road, arz, _, ensembles = bundle.parts
     for e in episodes:
-        _restart(road, ensembles, e)
+        _restart(road, arz, ensembles, e)
 
 
 @kernel_part
-def _restart(road: RoadArrays, ensembles: Ensembles, e: int) -> None:
+def _restart(road: Road, arz: ARZ, ensembles: Ensembles, e: int) -> None:
     members, n = ensembles.members[e], ensembles.n_members
     for i in range(members.shape[0]):
         members[i] = ensembles.priors[e, i]
     draws = draw(ensembles.streams[e, 0], members.shape[0] * n)
     _perturb(members, n, ensembles.initial_deviation, draws)
-    project_states(road, members, ensembles.is_box)
+    project_states(road, arz, members, ensembles.is_box)
 
 
 @kernel_part
@@ -248,96 +230,87 @@ def _perturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -
 @kernel
 def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict members one step ahead under inputs `(k, n_u)`, with noise, and project them."""
-    road, ensembles = bundle.parts
+    road, arz, _, ensembles = bundle.parts
     size, width = ensembles.members.shape[1:]
     scratch, deviation = make_batch_scratch(road, width), np.empty(size)
     for k in range(episodes.size):
         members = ensembles.members[episodes[k]]
         _process_deviation(road, ensembles, members, deviation)
-        advance_states(road, members, inputs[k], scratch)
+        advance_states(road, arz, members, inputs[k], scratch)
         draws = draw(ensembles.streams[episodes[k], 0], size * ensembles.n_members)
         _perturb(members, ensembles.n_members, deviation, draws)
-        project_states(road, members, ensembles.is_box)
+        project_states(road, arz, members, ensembles.is_box)
 
 
 @kernel_part
 def _process_deviation(
-    road: RoadArrays, ensembles: Ensembles, members: FloatArray, deviation: FloatArray
+    road: Road, ensembles: Ensembles, members: FloatArray, deviation: FloatArray
 ) -> None:
     """Write the deviations `(n_x,)` of the process noise of a step that leaves the members."""
     copy_vector(ensembles.process_deviation, deviation)
     if ensembles.density_growth == 0.0:
         return
     scale = ensembles.density_scale
-    for s in range(road.jam.size):
+    for s in range(road.n_segments):
         share = mean_of(members[2 * s], ensembles.n_members) / scale
         grown = (ensembles.density_growth * scale) ** 2 * share
         deviation[2 * s] = np.sqrt(deviation[2 * s] ** 2 + grown)
 
 
 @kernel
-def update(
-    bundle: Bundle,
-    episodes: IntArray,
-    observed: BoolArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-) -> None:
+def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
     """Update by measurements, perturbed for each member; see `Estimator.update`."""
-    road, ensembles = bundle.parts
-    rows = np.empty(road.row_first.size, dtype=np.int64)
+    road, arz, channels, ensembles = bundle.parts
+    indices = np.empty(channels.first.size, dtype=np.int64)
     for k in range(episodes.size):
-        e, seen, sound = episodes[k], rows_seen(observed[k], rows), True
+        e, seen, sound = episodes[k], find_observed(measured.observed[k], indices), True
         ensembles.innovations[e] = 0.0
         members = ensembles.members[e]
         if seen.size > 0:
-            sound = _assimilate(road, ensembles, e, seen, values[k], sigma[k], centre[k])
-            project_states(road, members, ensembles.is_box)
+            sound = _assimilate(bundle, e, seen, measured, k)
+            project_states(road, arz, members, ensembles.is_box)
         ensembles.diverged[e] = not (sound and is_finite(members))
         if ensembles.diverged[e]:
             ensembles.innovations[e] = 0.0
-            _restart(road, ensembles, e)
+            _restart(road, arz, ensembles, e)
 
 
 @kernel_part
-def _assimilate(
-    road: RoadArrays,
-    ensembles: Ensembles,
-    e: int,
-    rows: IntArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-) -> bool:
-    """Update the members of an episode by the m `rows` that are observed, and write innovations.
+def _assimilate(bundle: Bundle, e: int, seen: IntArray, measured: Measurement, k: int) -> bool:
+    """Update the members of episode e, the k-th one that was measured, and write innovations.
+
+    Args:
+        bundle: Road, model, channels and `Ensembles`.
+        e: The episode.
+        seen: `(m,)` channels that are observed.
+        measured: The measurement.
+        k: Index of the episode in it.
 
     Returns:
         Whether S is definite and the members are finite, before a projection that would bring
         infinities back into the bounds.
     """
+    road, arz, _, ensembles = bundle.parts
     members, n = ensembles.members[e], ensembles.n_members
     if ensembles.inflation != 1.0:
         _inflate(members, n, ensembles.inflation)
-        project_states(road, members, ensembles.is_box)
-    size, width, n_states = 2 * rows.size, members.shape[1], members.shape[0]
+        project_states(road, arz, members, ensembles.is_box)
+    size, width, n_states = 2 * seen.size, members.shape[1], members.shape[0]
     distances, residuals = np.empty((size, width)), np.empty((size, width))
-    differences, noise = _compare(
-        road, ensembles, e, rows, values, sigma, centre, distances, residuals
-    )
+    differences, noise = _compare(bundle, e, seen, measured, k, distances, residuals)
     states = np.zeros((padded(n_states), width))
     for i in range(n_states):
         _centre(members[i], n, 1.0, states[i])
     joint, gain = np.dot(distances, distances.T), np.dot(distances, states.T)
     if ensembles.tapers.size > 0:
-        _taper(ensembles, rows, joint, gain)
+        _taper(ensembles, seen, joint, gain)
     inverse = 1.0 / (n - 1)
     for i in range(size):
         for j in range(i):
             joint[i, j] *= inverse
         joint[i, i] = inverse * joint[i, i] + noise[i] ** 2
         innovation = differences[i] / np.sqrt(joint[i, i])
-        ensembles.innovations[e, rows[i // 2], i % 2] = innovation
+        ensembles.innovations[e, seen[i // 2], i % 2] = innovation
     if not factor(joint):
         return False
     solve_many(joint, gain)
@@ -359,13 +332,11 @@ def _inflate(members: FloatArray, n: int, factor: float) -> None:
 
 @kernel_part(fastmath={"contract"})
 def _compare(
-    road: RoadArrays,
-    ensembles: Ensembles,
+    bundle: Bundle,
     e: int,
-    rows: IntArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
+    seen: IntArray,
+    measured: Measurement,
+    k: int,
     distances: FloatArray,
     residuals: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
@@ -374,20 +345,22 @@ def _compare(
     Returns:
         The residuals of the mean, and the deviations of the noise, `(2 m,)` each.
     """
+    _, arz, channels, ensembles = bundle.parts
+    values, sigma, centre = measured.values[k], measured.sigma[k], measured.centre[k]
     members, n = ensembles.members[e], ensembles.n_members
-    units = np.array([ensembles.density_scale, road.second_scale])
-    differences, noise = np.empty(2 * rows.size), np.empty(2 * rows.size)
+    units = np.array([ensembles.density_scale, arz.second_scale])
+    differences, noise = np.empty(2 * seen.size), np.empty(2 * seen.size)
     outputs, work = np.empty((2, members.shape[1])), np.empty(members.shape[1])
     draws = draw(ensembles.streams[e, 1], differences.size * n)
     for r in range(differences.size):
-        m, kind = rows[r // 2], r % 2
+        m, kind = seen[r // 2], r % 2
         if kind == 0:
-            measure_row(road, m, members, centre, outputs[0], outputs[1], work)
+            measure_channel(arz, channels, m, members, centre, outputs[0], outputs[1], work)
         distance, residual, drawn = distances[r], residuals[r], draws[r * n : (r + 1) * n]
         mean = _centre(outputs[kind], n, units[kind], distance)
         size = sigma[m, kind] / units[kind]
         if kind == 0 and ensembles.count_variance[m] > 0.0:
-            counted = ensembles.count_variance[m] * mean * units[0] / road.row_span[m]
+            counted = ensembles.count_variance[m] * mean * units[0] / channels.span[m]
             size = np.sqrt(size**2 + counted)
         difference = values[m, kind] / units[kind] - mean
         for j in range(n):
@@ -398,12 +371,12 @@ def _compare(
 
 
 @kernel_part
-def _taper(ensembles: Ensembles, rows: IntArray, joint: FloatArray, gain: FloatArray) -> None:
+def _taper(ensembles: Ensembles, seen: IntArray, joint: FloatArray, gain: FloatArray) -> None:
     """Weigh covariances among outputs, and those with the states, by distance."""
     for i in range(joint.shape[0]):
-        among, weights = ensembles.row_tapers[rows[i // 2]], ensembles.tapers[rows[i // 2]]
+        among, weights = ensembles.channel_tapers[seen[i // 2]], ensembles.tapers[seen[i // 2]]
         for j in range(joint.shape[1]):
-            joint[i, j] *= among[rows[j // 2]]
+            joint[i, j] *= among[seen[j // 2]]
         for j in range(weights.size):
             gain[i, j] *= weights[j]
 
@@ -411,19 +384,19 @@ def _taper(ensembles: Ensembles, rows: IntArray, joint: FloatArray, gain: FloatA
 @kernel
 def summarise(bundle: Bundle, out: FloatArray) -> None:
     """Write density and speed of the mean and the deviations of members to `out` `(4, n, S)`."""
-    road, ensembles = bundle.parts
+    road, arz, _, ensembles = bundle.parts
     members, n = ensembles.members, ensembles.n_members
-    v_f, gamma, width = road.free_flow_speed, road.gamma, members.shape[2]
+    v_f, gamma, width = arz.free_flow_speed, arz.gamma, members.shape[2]
     speed, mean = np.empty(width), np.empty((3, 1))
     for e in range(members.shape[0]):
-        for s in range(road.jam.size):
+        for s in range(road.n_segments):
             rho, psi = members[e, 2 * s], members[e, 2 * s + 1]
             mean[0, 0], out[2, e, s] = _moments(rho, n)
             mean[1, 0] = mean_of(psi, n)
-            measured_speeds(mean[0], mean[1], road.jam[s], v_f, gamma, mean[2])
-            measured_speeds(rho, psi, road.jam[s], v_f, gamma, speed)
+            measured_speeds(mean[0], mean[1], arz.jam[s], v_f, gamma, mean[2])
+            measured_speeds(rho, psi, arz.jam[s], v_f, gamma, speed)
             _, out[3, e, s] = _moments(speed, n)
-            out[0, e, s] = min(mean[0, 0], road.jam[s])
+            out[0, e, s] = min(mean[0, 0], arz.jam[s])
             out[1, e, s] = min(max(mean[2, 0], 0.0), LARGEST_W * v_f)
 
 

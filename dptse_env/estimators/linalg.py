@@ -9,7 +9,7 @@ quantities are normalised.
 
 import numpy as np
 
-from dptse_env.model.network import RoadArrays
+from dptse_env.road import Road
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import fill_vector, kernel_part
 
@@ -30,7 +30,7 @@ def to_diagonal(i: int) -> int:
 
 @kernel_part(fastmath={"contract"})
 def multiply(
-    road: RoadArrays,
+    road: Road,
     blocks: FloatArray,
     by_factor: FloatArray,
     right: FloatArray,
@@ -47,8 +47,8 @@ def multiply(
         out: `(n_x, width)`, another matrix.
         is_lower: Whether to write only the lower half and what is left of the diagonal's register.
     """
-    n, width = 2 * road.jam.size, right.shape[1]
-    for c in range(road.jam.size):
+    n, width = 2 * road.n_segments, right.shape[1]
+    for c in range(road.n_segments):
         upper, lower = out[2 * c], out[2 * c + 1]
         if is_lower:
             width = to_diagonal(2 * c)
@@ -78,7 +78,7 @@ def multiply(
 
 @kernel_part
 def apply(
-    road: RoadArrays,
+    road: Road,
     blocks: FloatArray,
     by_factor: FloatArray,
     n_factors: int,
@@ -86,8 +86,8 @@ def apply(
     out: FloatArray,
 ) -> None:
     """Write A x `(>= n_x,)` to `out`, another vector; see `multiply`."""
-    n = 2 * road.jam.size
-    for c in range(road.jam.size):
+    n = 2 * road.n_segments
+    for c in range(road.n_segments):
         first, second = 0.0, 0.0
         for slot in range(road.degree[c]):
             b, block = road.neighbours[c, slot], blocks[c, slot]
@@ -103,7 +103,7 @@ def apply(
 
 @kernel_part
 def apply_transposed(
-    road: RoadArrays,
+    road: Road,
     blocks: FloatArray,
     by_factor: FloatArray,
     n_factors: int,
@@ -111,9 +111,9 @@ def apply_transposed(
     out: FloatArray,
 ) -> None:
     """Write A' x `(>= n_x,)` to `out`, another vector; see `multiply`."""
-    n = 2 * road.jam.size
+    n = 2 * road.n_segments
     fill_vector(out, 0.0)
-    for c in range(road.jam.size):
+    for c in range(road.n_segments):
         first, second = x[2 * c], x[2 * c + 1]
         for slot in range(road.degree[c]):
             b, block = road.neighbours[c, slot], blocks[c, slot]
@@ -126,7 +126,7 @@ def apply_transposed(
 
 @kernel_part(fastmath={"contract"})
 def propagate(
-    road: RoadArrays,
+    road: Road,
     blocks: FloatArray,
     by_factor: FloatArray,
     noise: FloatArray,

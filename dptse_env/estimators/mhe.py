@@ -27,7 +27,7 @@ from dptse_env.estimators.window import (
     minimise,
 )
 from dptse_env.model import ARZModel, Bounds
-from dptse_env.model.network import RoadArrays
+from dptse_env.model.arrays import ARZ, Channels
 from dptse_env.model.parameters import (
     LARGEST_FACTOR,
     LARGEST_W,
@@ -35,7 +35,8 @@ from dptse_env.model.parameters import (
     LEAST_FACTOR,
     LEAST_W,
 )
-from dptse_env.model.step import advance, make_scratch, normalise, project, write_row
+from dptse_env.model.step import advance, make_scratch, normalise, project, write_channel
+from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import integer, positive
 from dptse_env.utils.kernels import (
@@ -77,7 +78,7 @@ class Windows(NamedTuple):
     values: FloatArray  # (n, L, M, 2)
     noise: FloatArray  # (n, L, M, 2)
     centre: FloatArray  # (n, L, S) v_0 [km/h] of each stage's flows, NaN where they are speeds
-    weights: FloatArray  # (n, L, M, 2, 2 x largest span) of linearised rows
+    weights: FloatArray  # (n, L, M, 2, 2 x largest span) of linearised channels
     targets: FloatArray  # (n, L, M, 2) values less the constants of these
     solution: FloatArray  # (n, L, padded)
     active_set: IntArray  # (n, L, padded) bounds that the last solution is at, -1, 0 or 1
@@ -94,7 +95,7 @@ class Windows(NamedTuple):
 @kernel
 def restart(bundle: Bundle, e: int) -> None:
     """Reset an episode to a window of a single stage, its prior."""
-    _, filters, windows = bundle.parts
+    _, _, _, filters, windows = bundle.parts
     ekf.restart(filters, e)
     windows.length[e], windows.solved[e] = 1, UNSOLVED
     copy_vector(filters.initial_variance, windows.arrival_variance[e])
@@ -147,7 +148,7 @@ def _drop(stages: FloatArray) -> None:
 @kernel
 def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Append the model's prediction, under inputs `(k, n_u)`, to each window."""
-    road, filters, windows = bundle.parts
+    road, arz, _, filters, windows = bundle.parts
     scratch, state = make_scratch(road), np.empty(filters.means.shape[1])
     blocks = np.empty((*road.neighbours.shape, 4))
     for k in range(episodes.size):
@@ -160,36 +161,36 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
                 point[i] += windows.solution[e, t, i] / length
         copy_vector(filters.means[e], state)
         process_noise(road, filters, state, windows.process_variance[e, length - 1])
-        project(road, state, False)
-        advance(road, state, inputs[k], state, blocks, scratch)
-        project(road, state, filters.is_box)
+        project(road, arz, state, False)
+        advance(road, arz, state, inputs[k], state, blocks, scratch)
+        project(road, arz, state, filters.is_box)
         copy_vector(state, filters.means[e])
         copy_vector(inputs[k], windows.inputs[e, length - 1])
         if not windows.along:
-            _linearise_step(road, filters, windows, e, length - 1, point)
+            _linearise_step(road, arz, filters, windows, e, length - 1, point)
         windows.length[e] = length + 1
         _enter(filters, windows, e, length)
 
 
 @kernel_part
-def _physical(road: RoadArrays, windows: Windows, point: FloatArray) -> FloatArray:
+def _physical(road: Road, arz: ARZ, windows: Windows, point: FloatArray) -> FloatArray:
     """Return the state in the cone nearest to a normalised point [veh/km, veh/h]."""
     state = np.empty(windows.units.size)
     for i in range(state.size):
         state[i] = point[i] * windows.units[i]
-    project(road, state, False)
+    project(road, arz, state, False)
     return state
 
 
 @kernel_part
 def _linearise_step(
-    road: RoadArrays, filters: Filters, windows: Windows, e: int, t: int, point: FloatArray
+    road: Road, arz: ARZ, filters: Filters, windows: Windows, e: int, t: int, point: FloatArray
 ) -> None:
     """Linearise the step that leaves a stage, at the physical state nearest to a point."""
-    state, scratch = _physical(road, windows, point), make_scratch(road)
+    state, scratch = _physical(road, arz, windows, point), make_scratch(road)
     blocks, after, product = windows.blocks[e, t], state.copy(), np.empty(state.size)
-    advance(road, state, windows.inputs[e, t], after, blocks, scratch)
-    normalise(road, filters.units[0], blocks, scratch.by_factor)
+    advance(road, arz, state, windows.inputs[e, t], after, blocks, scratch)
+    normalise(arz, filters.units[0], blocks, scratch.by_factor)
     n_factors = windows.by_factor.shape[2]
     copy_matrix(scratch.by_factor[:n_factors], windows.by_factor[e, t])
     for i in range(state.size):
@@ -200,77 +201,74 @@ def _linearise_step(
 
 
 @kernel_part
-def _linearise_rows(road: RoadArrays, windows: Windows, e: int, t: int, point: FloatArray) -> None:
-    """Linearise the rows of a stage, at the physical state nearest to a point."""
-    state, constants = _physical(road, windows, point), np.empty(2)
-    for m in range(road.row_first.size):
+def _linearise_channels(
+    road: Road, arz: ARZ, channels: Channels, windows: Windows, e: int, t: int, point: FloatArray
+) -> None:
+    """Linearise the channels of a stage, at the physical state nearest to a point."""
+    state, constants = _physical(road, arz, windows, point), np.empty(2)
+    for m in range(channels.first.size):
         if windows.observed[e, t, m]:
             weights, centre = windows.weights[e, t, m], windows.centre[e, t]
-            write_row(road, windows.units, state, centre, m, weights, constants)
+            write_channel(arz, channels, windows.units, state, centre, m, weights, constants)
             for q in range(2):
                 windows.targets[e, t, m, q] = windows.values[e, t, m, q] - constants[q]
 
 
 @kernel
-def update(
-    bundle: Bundle,
-    episodes: IntArray,
-    observed: BoolArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-) -> None:
+def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
     """Update by measurements; see `Estimator.update`."""
-    road, filters, windows = bundle.parts
+    road, arz, channels, filters, windows = bundle.parts
     n, width = windows.units.size, windows.solution.shape[2]
     n_stages = windows.solution.shape[1] - 1
-    n_rows, size = windows.weights.shape[2], windows.weights.shape[4]
-    factor, free = make_factor(n_stages, n, n_rows, size, width), np.zeros((n_stages, n), np.int64)
+    n_channels, size = windows.weights.shape[2], windows.weights.shape[4]
+    factor, free = (
+        make_factor(n_stages, n, n_channels, size, width),
+        np.zeros((n_stages, n), np.int64),
+    )
     for k in range(episodes.size):
         e = episodes[k]
         _shift(windows, e)
         last = windows.length[e] - 1
-        copy_vector(observed[k], windows.observed[e, last])
-        copy_vector(centre[k], windows.centre[e, last])
+        copy_vector(measured.observed[k], windows.observed[e, last])
+        copy_vector(measured.centre[k], windows.centre[e, last])
         windows.solved[e], windows.fallback[e] = UNSOLVED, False
-        sound = _measure(road, filters, windows, e, values[k], sigma[k])
+        sound = _measure(bundle, e, measured, k)
         window, factor.length[0] = window_of(windows, e), 0
         active_set, z = windows.active_set[e, : last + 1], windows.solution[e, : last + 1].copy()
-        sound = sound and factorise(road, window, free, factor)
+        sound = sound and factorise(road, channels, window, free, factor)
         if sound:
             copy_matrix(factor.covariances[last], filters.covariances[e])
-            _innovate(road, filters, windows, e, factor.before)
+            _innovate(arz, channels, filters, windows, e, factor.before)
             for i in range(windows.units.size):
                 sound = sound and all_finite(filters.covariances[e, i])
-        if sound and any_of(observed[k]):
-            windows.solved[e] = minimise(road, window, factor, active_set, z)
+        if sound and any_of(measured.observed[k]):
+            windows.solved[e] = minimise(road, channels, window, factor, active_set, z)
             if windows.solved[e] == UNSOLVED:
                 windows.fallback[e] = True
                 windows.active_set[e] = 0
             else:
-                _accept(road, filters, windows, e, z)
+                _accept(road, arz, filters, windows, e, z)
         filters.diverged[e] = not sound
         if not sound:
             restart(bundle, e)
 
 
 @kernel_part
-def _measure(
-    road: RoadArrays,
-    filters: Filters,
-    windows: Windows,
-    e: int,
-    values: FloatArray,
-    sigma: FloatArray,
-) -> bool:
-    """Add values and noise to the last stage, and linearise; return whether all is finite."""
+def _measure(bundle: Bundle, e: int, measured: Measurement, k: int) -> bool:
+    """Add what was measured of episode e, the k-th one, to the last stage, and linearise.
+
+    Returns:
+        Whether all is finite.
+    """
+    road, arz, channels, filters, windows = bundle.parts
+    values, sigma = measured.values[k], measured.sigma[k]
     last, mean, sound = windows.length[e] - 1, filters.means[e], True
     for i in range(mean.size):
         sound = sound and math.isfinite(mean[i])
-    for m in range(road.row_first.size):
-        first, span, density = road.row_first[m], road.row_span[m], 0.0
+    for m in range(channels.first.size):
+        first, span, density = channels.first[m], channels.span[m], 0.0
         for q in range(2):
-            unit = filters.units[0] if q == 0 else road.second_scale
+            unit = filters.units[0] if q == 0 else arz.second_scale
             value = values[m, q] / unit if windows.observed[e, last, m] else 0.0
             windows.values[e, last, m, q] = value
             deviation = max(sigma[m, q], LEAST_DEVIATION * unit) / unit
@@ -281,17 +279,17 @@ def _measure(
         windows.noise[e, last, m, 0] += filters.count_variance[m] * density / span**2
     if windows.along:
         for t in range(last + 1):
-            _linearise_rows(road, windows, e, t, windows.solution[e, t])
+            _linearise_channels(road, arz, channels, windows, e, t, windows.solution[e, t])
             if t < last:
-                _linearise_step(road, filters, windows, e, t, windows.solution[e, t])
+                _linearise_step(road, arz, filters, windows, e, t, windows.solution[e, t])
     else:
-        _linearise_rows(road, windows, e, last, windows.point[e])
+        _linearise_channels(road, arz, channels, windows, e, last, windows.point[e])
     return sound
 
 
 @kernel_part
 def _innovate(
-    road: RoadArrays, filters: Filters, windows: Windows, e: int, before: FloatArray
+    arz: ARZ, channels: Channels, filters: Filters, windows: Windows, e: int, before: FloatArray
 ) -> None:
     """Write residuals at the prediction over the deviations that the window expects.
 
@@ -300,12 +298,12 @@ def _innovate(
     last, weights, constants = windows.length[e] - 1, windows.weights[e], np.empty(2)
     at_mean = np.empty(weights.shape[2:])
     filters.innovations[e] = 0.0
-    for m in range(road.row_first.size):
+    for m in range(channels.first.size):
         if not windows.observed[e, last, m]:
             continue
-        first, size = 2 * road.row_first[m], 2 * road.row_span[m]
+        first, size = 2 * channels.first[m], 2 * channels.span[m]
         mean, centre = filters.means[e], windows.centre[e, last]
-        write_row(road, windows.units, mean, centre, m, at_mean, constants)
+        write_channel(arz, channels, windows.units, mean, centre, m, at_mean, constants)
         for q in range(2):
             gap, variance = windows.values[e, last, m, q] - constants[q], 0.0
             for i in range(size):
@@ -318,7 +316,9 @@ def _innovate(
 
 
 @kernel_part
-def _accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: FloatArray) -> None:
+def _accept(
+    road: Road, arz: ARZ, filters: Filters, windows: Windows, e: int, z: FloatArray
+) -> None:
     """Accept a solution `(L, padded)`, whose last state is the estimate."""
     for t in range(windows.length[e]):
         for i in range(windows.units.size):
@@ -327,7 +327,7 @@ def _accept(road: RoadArrays, filters: Filters, windows: Windows, e: int, z: Flo
             windows.active_set[e, t, i] = int(at_upper) - int(at_lower)
     for i in range(windows.units.size):
         filters.means[e, i] = z[windows.length[e] - 1, i] * windows.units[i]
-    project(road, filters.means[e], filters.is_box)
+    project(road, arz, filters.means[e], filters.is_box)
 
 
 @kernel_part
@@ -353,17 +353,17 @@ def window_of(windows: Windows, e: int) -> Window:
 @kernel
 def write_program(bundle: Bundle, e: int, H: FloatArray, q: FloatArray) -> None:
     """Write H `(L, n_x, L, n_x)` and q `(L, n_x)` of an episode: z' H z + q' z."""
-    road, _, windows = bundle.parts
+    road, _, channels, _, windows = bundle.parts
     window, length, n = window_of(windows, e), windows.length[e], windows.units.size
     iterate = make_iterate(length, windows.solution.shape[2], windows.observed.shape[2])
-    evaluate(road, window, iterate)
+    evaluate(road, channels, window, iterate)
     # At z = 0 the negative gradient of half the objective is -q / 2, at a unit vector e less H e.
     start = iterate.negative_gradient.copy()
     q[:] = -2.0 * start[:, :n]
     for t in range(length):
         for i in range(n):
             iterate.z[t, i] = 1.0
-            evaluate(road, window, iterate)
+            evaluate(road, channels, window, iterate)
             iterate.z[t, i] = 0.0
             H[t, i] = start[:, :n] - iterate.negative_gradient[:, :n]
 
@@ -380,7 +380,7 @@ class MHE(CovarianceFilter):
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings_of_mhe(settings))
         self._windows = _allocate(model, settings, self.fallback)
-        self._all = Bundle(model.road, self.filters, self._windows)
+        self._all = Bundle(*model.dynamics, self.filters, self._windows)
         self._restart(np.arange(n_episodes))
 
     @staticmethod
@@ -413,8 +413,7 @@ class MHE(CovarianceFilter):
         predict(self._all, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        observed, values, sigma, centre = measured
-        update(self._all, episodes, observed, values, sigma, centre)
+        update(self._all, episodes, measured)
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():
@@ -423,7 +422,12 @@ class MHE(CovarianceFilter):
 
 def _allocate(model: ARZModel, settings: EstimatorSettings, fallback: BoolArray) -> Windows:
     """Return empty windows of n episodes, which write to `fallback` `(n,)`."""
-    n, s, n_rows, n_episodes = model.n_states, model.n_segments, model.rows.n_rows, fallback.size
+    n, s, n_channels, n_episodes = (
+        model.n_states,
+        model.n_segments,
+        model.channels.size,
+        fallback.size,
+    )
     width, shape = padded(n), (n_episodes, settings.mhe.horizon + 2)
     lower, upper = normalised_bounds(model, settings.mhe.bounds)
     return Windows(
@@ -435,12 +439,12 @@ def _allocate(model: ARZModel, settings: EstimatorSettings, fallback: BoolArray)
         blocks=np.zeros((*shape, *model.road.neighbours.shape, 4)),
         by_factor=np.zeros((*shape, model.n_demand_states, 2)),
         offsets=np.zeros((*shape, n)),
-        observed=np.zeros((*shape, n_rows), dtype=np.bool_),
-        values=np.zeros((*shape, n_rows, 2)),
-        noise=np.ones((*shape, n_rows, 2)),
+        observed=np.zeros((*shape, n_channels), dtype=np.bool_),
+        values=np.zeros((*shape, n_channels, 2)),
+        noise=np.ones((*shape, n_channels, 2)),
         centre=np.zeros((*shape, s)),
-        weights=np.zeros((*shape, n_rows, 2, 2 * int(model.rows.span.max()))),
-        targets=np.zeros((*shape, n_rows, 2)),
+        weights=np.zeros((*shape, n_channels, 2, 2 * int(model.channels.span.max()))),
+        targets=np.zeros((*shape, n_channels, 2)),
         solution=np.zeros((*shape, width)),
         active_set=np.zeros((*shape, width), dtype=np.int64),
         point=np.zeros((n_episodes, width)),

@@ -10,7 +10,7 @@ from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.recurrent import Recurrent
 from dptse_env.estimators.settings import EstimatorSettings, RecurrentSettings
 from dptse_env.model import ARZModel
-from dptse_env.model.network import RoadNetwork
+from dptse_env.road import Road
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.fields import within
 
@@ -61,11 +61,11 @@ class Mixture(BatchEstimator):
 
     @staticmethod
     def inherits(
-        network: RoadNetwork, flows: bool, largest_span: int, settings: EstimatorSettings
+        road: Road, flows: bool, largest_span: int, settings: EstimatorSettings
     ) -> tuple[str, ...]:
         """Return the setting of the experts where no network was trained on such roads."""
         found = [
-            bool(kind.inherits(network, flows, largest_span, own))
+            bool(kind.inherits(road, flows, largest_span, own))
             for kind, own in _experts(settings)
             if issubclass(kind, Recurrent)
         ]
@@ -128,9 +128,9 @@ class Mixture(BatchEstimator):
             second = density * slip
             variance = (density * speed_std) ** 2 + (slip * density_std) ** 2
         # einsum, whose bits do not depend on the batch as those of a product of matrices do.
-        means = self.model.rows.averages(np.stack([density, second], axis=-1))
+        means = self.model.averages(np.stack([density, second], axis=-1))
         variances = np.einsum(
-            "ms,nsk->nmk", self.model.rows.weights**2, np.stack([density_std**2, variance], axis=-1)
+            "ms,nsk->nmk", self.model.averaging**2, np.stack([density_std**2, variance], axis=-1)
         )
         return measured.values - means, np.maximum(variances + measured.sigma**2, LEAST_VARIANCE)
 

@@ -19,6 +19,7 @@ from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
 from dptse_env.estimators.recurrent_kernels import (
     CHANNELS,
     LONGEST_AGE,
+    Memory,
     Network,
     advance,
     make_cells,
@@ -28,9 +29,10 @@ from dptse_env.estimators.recurrent_kernels import (
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
-from dptse_env.model.network import RoadNetwork
+from dptse_env.road import Road
 from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
 from dptse_env.utils.files import read_tensors, require_arrays, write_tensors
+from dptse_env.utils.kernels import Bundle
 
 LARGEST_WIDTH = 512
 FORMAT = "recurrent-2"
@@ -52,7 +54,6 @@ class Recurrent(BatchEstimator):
 
     Attributes:
         saved: The network in force, with its card.
-        cells: The cells of the road.
         hidden: Hidden states, shape (n, S, H).
     """
 
@@ -64,8 +65,7 @@ class Recurrent(BatchEstimator):
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
         flows = model.reference_speed is not None
-        self.saved = network_for(settings.recurrent.weights, model.network, flows)
-        self.cells = make_cells(model)
+        self.saved = network_for(settings.recurrent.weights, model.road, flows)
         S, n = model.n_segments, n_episodes
         self.hidden = np.zeros((n, S, self.saved.network.width), dtype=np.float32)
         self._present, self._ahead, self._prior = np.zeros((3, n, S, 4))
@@ -74,27 +74,29 @@ class Recurrent(BatchEstimator):
         deviation = np.sqrt(settings.initial_variance)
         spread = deviation * np.array([model.density_scale, model.speed_scale])
         self._present[..., 2:] = self._prior[..., 2:] = spread
+        memory = Memory(self._inputs, self._present, self._age, self.innovations)
+        self._bundle = Bundle(model.road, model.channels, make_cells(model), memory)
 
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
         """Refuse weights that are missing or cannot be read."""
         flows = model.reference_speed is not None
-        network_for(settings.recurrent.weights, model.network, flows)
+        network_for(settings.recurrent.weights, model.road, flows)
 
     @staticmethod
     def inherits(
-        network: RoadNetwork, flows: bool, largest_span: int, settings: EstimatorSettings
+        road: Road, flows: bool, largest_span: int, settings: EstimatorSettings
     ) -> tuple[str, ...]:
         """Return the setting of the weights where they were trained on other roads or releases.
 
         Args:
-            network: The road.
+            road: The road.
             flows: Whether flows are released, not speeds.
             largest_span: Largest number of segments of a query.
             settings: The settings.
         """
-        saved = network_for(settings.recurrent.weights, network, flows)
-        is_outside = outside(saved, network, flows, largest_span)
+        saved = network_for(settings.recurrent.weights, road, flows)
+        is_outside = outside(saved, road, flows, largest_span)
         return ("estimator_settings.recurrent.weights",) if is_outside else ()
 
     @property
@@ -123,10 +125,8 @@ class Recurrent(BatchEstimator):
         network = self.saved.network
         shape = episodes.size, self.model.n_segments, len(network.inputs)
         x = np.empty(shape, dtype=np.float32)
-        state = self._inputs, self._present, self._age, self.innovations
-        observed, values, sigma, centre = measured
-        read(self.cells, episodes, observed, values, sigma, centre, *state, x)
-        advance(self.cells, network, episodes, x, self.hidden, self._present, self._ahead)
+        read(self._bundle, episodes, measured, x)
+        advance(self._bundle, network, episodes, x, self.hidden, self._ahead)
         # Gates hold what is not finite to their range: the state does not show it.
         sound = np.all(np.isfinite(measured.values) | ~measured.observed[..., None], axis=(1, 2))
         sound &= np.isfinite(self._inputs[episodes]).all(axis=1)
@@ -139,13 +139,13 @@ class Recurrent(BatchEstimator):
         return Estimate(*(self._present[..., j].copy() for j in range(4)))
 
 
-def outside(saved: SavedNetwork, network: RoadNetwork, flows: bool, largest_span: int) -> list[str]:
+def outside(saved: SavedNetwork, road: Road, flows: bool, largest_span: int) -> list[str]:
     """Return the properties of a road and its releases that a network was not trained on."""
     found: dict[str, Sequence[float]] = {
-        "n_mainline": (network.n_mainline,),
-        "segment_length": network.segment_lengths,
-        "speed_limit": network.speed_limits,
-        "lanes": network.segment_lanes,
+        "n_mainline": (road.n_mainline,),
+        "segment_length": road.lengths.tolist(),
+        "speed_limit": road.limits.tolist(),
+        "lanes": road.lanes.tolist(),
         "span": (largest_span,),
         "flows": (flows,),
     }
@@ -172,12 +172,12 @@ class SavedNetwork:
     source: str
 
 
-def network_for(weights: str | None, network: RoadNetwork, flows: bool) -> SavedNetwork:
+def network_for(weights: str | None, road: Road, flows: bool) -> SavedNetwork:
     """Return the network of a setting for a road: of `SHIPPED` the first that suits it, if None.
 
     Args:
         weights: The setting, see `RecurrentSettings`.
-        network: The road.
+        road: The road.
         flows: Whether flows are released, not speeds.
 
     Raises:
@@ -187,7 +187,7 @@ def network_for(weights: str | None, network: RoadNetwork, flows: bool) -> Saved
         return read_network(member_for(weights, flows))
     members = (member_for(name, flows) for name in SHIPPED)
     for saved in (read_network(each) for each in members if each in shipped_networks()):
-        if not outside(saved, network, flows, 1):
+        if not outside(saved, road, flows, 1):
             break
     return saved
 

@@ -33,9 +33,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dptse_env.estimators.base import Measurement
 from dptse_env.model import ARZModel
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import inline_part, kernel, kernel_part
+from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.kernels import Bundle, inline_part, kernel, kernel_part
 
 Float32Array = NDArray[np.float32]
 
@@ -79,48 +80,30 @@ _ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
 
 class Cells(NamedTuple):
-    """The cells of a road."""
+    """What a network is told of the cells of a road, which never changes."""
 
-    edges: IntArray  # (E, 2) cells (from, to) between which vehicles pass
-    entries: IntArray  # (1 + I,) cells with inflow from outside
-    entry_inputs: IntArray  # (1 + I,) column of the model's inputs with the inflow [veh/h]
-    exits: IntArray  # (1 + O,) cells with outflow to outside
-    exit_inputs: IntArray  # (1 + O,) column of the model's inputs with the density there [veh/km]
-    exit_units: FloatArray  # (1 + O,) unit of that density [veh/km]
-    lanes: FloatArray  # (S,)
-    unit: FloatArray  # (S,) unit of densities [veh/km]
+    unit: FloatArray  # (S + R,) unit of densities [veh/km]
     limit: float  # largest speed limit [km/h], the unit of speeds
     flows: bool  # whether flows are released, otherwise speeds
-    row_first: IntArray  # (M,) first cell of each row of a measurement
-    row_span: IntArray  # (M,) number of cells of each row
-    fixed: FloatArray  # (S, N_FIXED) numbers that never change
+    fixed: FloatArray  # (S, N_FIXED) inputs of the network
 
 
 def make_cells(model: ARZModel) -> Cells:
-    """Return the cells of a model's road, and of the measurements that it may get."""
-    network, layout = model.network, model.layout
-    marks = np.zeros((layout.n_segments, 4))
-    for kind, ramps in enumerate((network.on_ramp_segments, network.off_ramp_segments)):
-        for segments in ramps:
-            marks[list(segments), kind] = 1.0
-    marks[layout.entries, 2] = 1.0
-    marks[layout.exits, 3] = 1.0
-    limits = np.array(network.speed_limits)
-    scales = np.stack([np.log(layout.lengths / 0.1), np.log(limits / 100.0)], axis=1)
+    """Return what a network is told of a model's road."""
+    road, S = model.road, model.n_segments
+    n_on = road.entries.size - 1
+    marks = np.zeros((S, 4))
+    marks[:, 0] = (road.stretch > 0) & (road.stretch <= n_on)
+    marks[:, 1] = road.stretch > n_on
+    marks[road.entries, 2] = 1.0
+    marks[road.exits, 3] = 1.0
+    lengths, lanes, limits = road.lengths[:S], road.lanes[:S], road.limits[:S]
+    scales = np.stack([np.log(lengths / 0.1), np.log(limits / 100.0)], axis=1)
     return Cells(
-        edges=layout.edges,
-        entries=layout.entries,
-        entry_inputs=layout.entry_inputs,
-        exits=layout.exits,
-        exit_inputs=layout.exit_inputs,
-        exit_units=DENSITY_UNIT * layout.exit_lanes,
-        lanes=layout.lanes,
-        unit=DENSITY_UNIT * layout.lanes,
+        unit=DENSITY_UNIT * road.lanes,
         limit=float(limits.max()),
         flows=model.reference_speed is not None,
-        row_first=model.rows.first,
-        row_span=model.rows.span,
-        fixed=np.concatenate([marks, layout.lanes[:, None] / 3.0, scales], axis=1),
+        fixed=np.concatenate([marks, lanes[:, None] / 3.0, scales], axis=1),
     )
 
 
@@ -158,36 +141,33 @@ def shapes(width: int) -> dict[str, tuple[int, ...]]:
     }
 
 
+class Memory(NamedTuple):
+    """What a network is given beside the releases, of n episodes."""
+
+    inputs: FloatArray  # (n, n_u) the model's inputs of the last prediction
+    present: FloatArray  # (n, S, 4) predictions, then estimates, and their deviations
+    age: FloatArray  # (n, S) seconds since the last measurement
+    innovations: FloatArray  # (n, M, 2)
+
+
 @kernel
-def read(
-    cells: Cells,
-    episodes: IntArray,
-    observed: BoolArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-    inputs: FloatArray,
-    present: FloatArray,
-    age: FloatArray,
-    innovations: FloatArray,
-    x: Float32Array,
-) -> None:
-    """Write the channels of all cells, and innovations; count the age of measurements on.
+def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Array) -> None:
+    """Write the network's inputs of all cells, and innovations; count the age of measurements on.
 
     Args:
-        cells: The road.
+        bundle: Road, channels, `Cells` and `Memory`, whose age and innovations are updated.
         episodes: Shape (k,).
-        observed: Shape (k, M).
-        values: Shape (k, M, 2).
-        sigma: Shape (k, M, 2).
-        centre: Shape (k, S).
-        inputs: Inputs of the last prediction, shape (n, n_u).
-        present: Predictions and their deviations, shape (n, S, 4).
-        age: Seconds since the last measurement, shape (n, S), updated.
-        innovations: Shape (n, M, 2), updated.
-        x: Output, shape (k, S, C or more).
+        measured: The release of the k episodes.
+        x: Output, shape (k, S, `N_CHANNELS` or more).
     """
-    S = cells.lanes.size
+    road, channels, cells, memory = bundle.parts
+    inputs, present, age, innovations = (
+        memory.inputs,
+        memory.present,
+        memory.age,
+        memory.innovations,
+    )
+    S = road.n_segments
     sums, second = np.empty((S, 10)), np.empty((S, 4))
     outside = np.empty((S, 2))
     for i in range(episodes.size):
@@ -196,20 +176,22 @@ def read(
         sums[:], outside[:] = 0.0, 0.0
         innovations[episode] = 0.0
         for s in range(S):
-            _predict_second(cells.flows, centre[i, s], prior[s], second[s])
-        for m in range(cells.row_first.size):
-            if observed[i, m]:
-                first, span = cells.row_first[m], cells.row_span[m]
+            _predict_second(cells.flows, measured.centre[i, s], prior[s], second[s])
+        for m in range(channels.first.size):
+            if measured.observed[i, m]:
+                first, span = channels.first[m], channels.span[m]
                 covered = slice(first, first + span)
-                _read_row(
-                    values[i, m], sigma[i, m], prior[covered], second[covered], sums[covered],
+                values, sigma = measured.values[i, m], measured.sigma[i, m]
+                _read_channel(
+                    values, sigma, prior[covered], second[covered], sums[covered],
                     innovations[episode, m],
                 )  # fmt: skip
-        for e in range(cells.entries.size):
-            s = cells.entries[e]
-            outside[s, 0] = inputs[episode, cells.entry_inputs[e]] / (2000.0 * cells.lanes[s])
-        for e in range(cells.exits.size):
-            outside[cells.exits[e], 1] = inputs[episode, cells.exit_inputs[e]] / cells.exit_units[e]
+        for e in range(road.entries.size):
+            s = road.entries[e]
+            outside[s, 0] = inputs[episode, road.entry_inputs[e]] / (2000.0 * road.lanes[s])
+        for e in range(road.exits.size):
+            density, unit = inputs[episode, road.exit_inputs[e]], cells.unit[road.exit_cells[e]]
+            outside[road.exits[e], 1] = density / unit
         for s in range(S):
             row = x[i, s]
             _write(cells, s, prior[s], second[s], sums[s], age[episode, s], row)
@@ -230,7 +212,7 @@ def _predict_second(flows: bool, centre: float, prior: FloatArray, second: Float
 
 
 @inline_part
-def _read_row(
+def _read_channel(
     values: FloatArray,
     sigma: FloatArray,
     prior: FloatArray,
@@ -238,7 +220,7 @@ def _read_row(
     sums: FloatArray,
     innovation: FloatArray,
 ) -> None:
-    """Write the innovation of a row, and add what it says to the sums of the cells it covers."""
+    """Write the innovation of a channel, and add what it says to the sums of its cells."""
     span = len(prior)
     share = 1.0 / span
     for j in range(2):
@@ -269,7 +251,7 @@ def _write(
     age: float,
     row: Float32Array,
 ) -> None:
-    """Write the channels of a cell, by what the rows that cover it say."""
+    """Write the channels of a cell, by what the channels that cover it say."""
     unit, limit, flows = cells.unit[s], cells.limit, 1.0 if cells.flows else 0.0
     by_speed, slip = second[2], second[3]
     density_variance, speed_variance = prior[2] ** 2, prior[3] ** 2
@@ -300,26 +282,26 @@ def _correction(value: float) -> float:
 
 @kernel
 def advance(
-    cells: Cells,
+    bundle: Bundle,
     network: Network,
     episodes: IntArray,
     x: Float32Array,
     hidden: Float32Array,
-    present: FloatArray,
     ahead: FloatArray,
 ) -> None:
     """Advance the hidden states, and write what the heads read from them.
 
     Args:
-        cells: The road.
+        bundle: Road, channels, `Cells` and `Memory`, whose estimates of this second are updated.
         network: The weights.
         episodes: Shape (k,).
         x: Shape (k, S, C + 2 M): the channels, and space for sums of messages.
         hidden: Hidden states, shape (n, S, H), updated.
-        present: Estimates and deviations of this second, shape (n, S, 4), updated.
-        ahead: Those of the next second before its release, shape (n, S, 4), updated.
+        ahead: Estimates of the next second before its release, shape (n, S, 4), updated.
     """
-    S, H = cells.lanes.size, network.hidden.shape[0]
+    road, _, cells, memory = bundle.parts
+    present = memory.present
+    S, H = road.n_segments, network.hidden.shape[0]
     M = (network.inputs.shape[0] - N_CHANNELS) // 2
     g, q = np.empty((S, 3 * H), dtype=np.float32), np.empty((S, 3 * H), dtype=np.float32)
     raw = np.empty((S, network.heads.shape[1]), dtype=np.float32)
@@ -327,8 +309,8 @@ def advance(
     for i in range(episodes.size):
         h = hidden[episodes[i]]
         x[i, :, N_CHANNELS:] = 0.0
-        for e in range(cells.edges.shape[0]):
-            start, end = cells.edges[e, 0], cells.edges[e, 1]
+        for e in range(road.edges.shape[0]):
+            start, end = road.edges[e, 0], road.edges[e, 1]
             for j in range(M):
                 x[i, end, N_CHANNELS + j] += h[start, j]
                 x[i, start, N_CHANNELS + M + j] += h[end, j]

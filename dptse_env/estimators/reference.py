@@ -111,8 +111,10 @@ class Problem:
 
         Deviations are at least `least`, but for what counts add to them.
         """
-        rows, variance = self.model.rows, np.maximum(seen.sigma / self.release_unit, least) ** 2
-        variance[:, 0] += self._count_variance * (rows.weights @ self._density(x)) / rows.span
+        variance = np.maximum(seen.sigma / self.release_unit, least) ** 2
+        variance[:, 0] += self._count_variance * (
+            self.model.averaging @ self._density(x) / self.model.channels.span
+        )
         return np.asarray(variance[seen.observed].ravel())
 
     def _density(self, x: FloatArray) -> FloatArray:
@@ -243,7 +245,7 @@ class _ExtendedFilter(EpisodeFilter, ExtendedKalmanFilter):  # type: ignore[misc
     """filterpy's filter with the derivatives of the problem."""
 
     def __init__(self, problem: Problem) -> None:
-        super().__init__(problem.n_states, 2 * problem.model.rows.n_rows)
+        super().__init__(problem.n_states, 2 * problem.model.channels.size)
         self.problem = problem
 
     def predict_x(self, u: FloatArray) -> None:
@@ -289,7 +291,7 @@ class _UnscentedFilter(EpisodeFilter, UnscentedKalmanFilter):  # type: ignore[mi
     def __init__(self, problem: Problem) -> None:
         ukf, n = problem.settings.ukf, problem.n_states
         points = MerweScaledSigmaPoints(n, alpha=ukf.alpha, beta=ukf.beta, kappa=ukf.kappa)
-        sizes = n, 2 * problem.model.rows.n_rows, problem.model.time_step
+        sizes = n, 2 * problem.model.channels.size, problem.model.time_step
         super().__init__(*sizes, None, None, points, x_mean_fn=_mean, z_mean_fn=_mean)
         self.problem = problem
 
@@ -340,7 +342,7 @@ class _Ensemble(EpisodeFilter):
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.enkf = problem, problem.settings.enkf
-        n_rows, taper = problem.model.rows.n_rows, self.enkf.taper
+        n_rows, taper = problem.model.channels.size, self.enkf.taper
         self.tapers = np.ones((n_rows, problem.n_states)), np.ones((n_rows, n_rows))
         if taper is not None:
             self.tapers = make_tapers(problem.model, taper)
@@ -379,9 +381,9 @@ class _Ensemble(EpisodeFilter):
         outputs, z = problem.h(members, seen), problem.z(seen)
         R = problem.R(members.mean(axis=0), seen)
         X, D = members - members.mean(axis=0), outputs - outputs.mean(axis=0)
-        with_states, among_rows = self.tapers
+        with_states, among_channels = self.tapers
         cross = with_states[row].T * (X.T @ D) / (len(members) - 1)
-        S = among_rows[np.ix_(row, row)] * (D.T @ D) / (len(members) - 1) + np.diag(R)
+        S = among_channels[np.ix_(row, row)] * (D.T @ D) / (len(members) - 1) + np.diag(R)
         np.linalg.cholesky(S)  # refuses one that is not definite
         drawn = draw(self.measurement, outputs.size).reshape(outputs.shape[::-1]).T
         residuals = z + np.sqrt(R) * drawn - outputs

@@ -1,7 +1,7 @@
 """Baselines of estimators: a random walk, its blend with an EKF, and the traffic model alone."""
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,17 @@ from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import MEASUREMENT_FLOOR
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import kernel
+from dptse_env.utils.kernels import Bundle, kernel
+
+
+class Walks(NamedTuple):
+    """Scalar filters of n episodes."""
+
+    largest: FloatArray  # (S, 2) largest means [veh/km, km/h]
+    means: FloatArray  # (n, S, 2)
+    variances: FloatArray  # (n, S, 2)
+    innovations: FloatArray  # (n, M, 2)
+    diverged: BoolArray  # (n,)
 
 
 class RandomWalk(BatchEstimator):
@@ -37,10 +47,12 @@ class RandomWalk(BatchEstimator):
         self._process_variance = (np.array(settings.walk_noise) * scale) ** 2
         self._initial_variance = settings.initial_variance * scale**2
         speeds = np.full(model.n_segments, model.largest_speed)
-        self._largest = np.stack([model.jam_density, speeds], axis=-1)
+        self._largest = largest = np.stack([model.jam_density, speeds], axis=-1)
         shape = (n_episodes, model.n_segments, 2)
         self.means, self._priors = np.zeros(shape), np.zeros(shape)
         self.variances = np.broadcast_to(self._initial_variance, shape).copy()
+        walks = Walks(largest, self.means, self.variances, self.innovations, self.diverged)
+        self._bundle = Bundle(model.channels, walks)
 
     @property
     def states(self) -> FloatArray:
@@ -78,12 +90,7 @@ class RandomWalk(BatchEstimator):
         self.variances[episodes] += self._process_variance
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        rows = self.model.rows
-        observed, values, sigma, centre = measured
-        _correct(
-            rows.first, rows.span, self._largest, self.means, self.variances, self.innovations,
-            self.diverged, episodes, observed, values, sigma, centre,
-        )  # fmt: skip
+        _correct(self._bundle, episodes, measured)
         lost = episodes[self.diverged[episodes]]
         if lost.size > 0:
             self._restart(lost)
@@ -95,54 +102,32 @@ class RandomWalk(BatchEstimator):
 
 
 @kernel
-def _correct(
-    first: IntArray,
-    span: IntArray,
-    largest: FloatArray,
-    means: FloatArray,
-    variances: FloatArray,
-    innovations: FloatArray,
-    diverged: BoolArray,
-    episodes: IntArray,
-    observed: BoolArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-) -> None:
-    """Update by one row after the other, by its density and then by its other number.
+def _correct(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
+    """Update episodes `(k,)` by one channel after the other, by its density, then its other number.
 
     Either is a sum of its segments' densities or speeds, of known weights. The variances are in
     Joseph form, in which no nearly equal numbers are subtracted.
-
-    Args:
-        first: `(M,)` first segments of the rows.
-        span: `(M,)` numbers of their segments.
-        largest: `(S, 2)` largest means.
-        means: `(n, S, 2)`, updated.
-        variances: `(n, S, 2)`, updated.
-        innovations: `(n, M, 2)`, written.
-        diverged: `(n,)`, written with whether a residual is not finite.
-        episodes: `(k,)`.
-        observed: `(k, M)`, of a `Measurement`, as the others below.
-        values: `(k, M, 2)`.
-        sigma: `(k, M, 2)`.
-        centre: `(k, S)`.
     """
+    channels, walks = bundle.parts
+    first, span, largest = channels.first, channels.span, walks.largest
+    innovations, diverged = walks.innovations, walks.diverged
     weights = np.empty(largest.shape[0])
     for k in range(episodes.size):
-        mean, variance = means[episodes[k]], variances[episodes[k]]
+        mean, variance = walks.means[episodes[k]], walks.variances[episodes[k]]
+        centre = measured.centre[k]
         innovations[episodes[k]] = 0.0
         diverged[episodes[k]] = False
         for m in range(first.size):
-            if not observed[k, m]:
+            if not measured.observed[k, m]:
                 continue
             for i in range(2):
-                residual, noise, spread = values[k, m, i], sigma[k, m, i] ** 2, 0.0
+                residual, noise = measured.values[k, m, i], measured.sigma[k, m, i] ** 2
+                spread = 0.0
                 for s in range(first[m], first[m] + span[m]):
                     weights[s] = 1.0 / span[m]
-                    if i == 1 and not np.isnan(centre[k, s]):
+                    if i == 1 and not np.isnan(centre[s]):
                         weights[s] *= max(mean[s, 0], MEASUREMENT_FLOOR * largest[s, 0])
-                        residual += weights[s] * centre[k, s]
+                        residual += weights[s] * centre[s]
                     residual -= weights[s] * mean[s, i]
                     spread += weights[s] ** 2 * variance[s, i]
                 total = spread + noise

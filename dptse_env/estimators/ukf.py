@@ -17,7 +17,13 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.estimators.base import Measurement
-from dptse_env.estimators.ekf import CovarianceFilter, Filters, process_noise, restart, rows_seen
+from dptse_env.estimators.ekf import (
+    CovarianceFilter,
+    Filters,
+    find_observed,
+    process_noise,
+    restart,
+)
 from dptse_env.estimators.linalg import (
     downdate,
     factor,
@@ -31,10 +37,9 @@ from dptse_env.model import ARZModel
 from dptse_env.model.columns import (
     advance_states,
     make_batch_scratch,
-    measure_row,
+    measure_channel,
     project_states,
 )
-from dptse_env.model.network import RoadArrays
 from dptse_env.model.step import project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import require
@@ -86,14 +91,13 @@ class UKF(CovarianceFilter):
             surplus=beta - alpha**2,
             spread=float(np.sqrt(spread)),
         )
-        self._all = Bundle(model.road, self.filters, self._points)
+        self._all = Bundle(*model.dynamics, self.filters, self._points)
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         predict(self._all, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        observed, values, sigma, centre = measured
-        update(self._all, episodes, observed, values, sigma, centre)
+        update(self._all, episodes, measured)
 
     def _restart(self, episodes: IntArray) -> None:
         self._points.moved[episodes] = False
@@ -103,7 +107,7 @@ class UKF(CovarianceFilter):
 @kernel
 def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict one step ahead under inputs `(k, n_u)` by points that are made, moved, projected."""
-    road, filters, points = bundle.parts
+    road, arz, _, filters, points = bundle.parts
     n, width = points.states.shape[1:]
     scratch, noise, shift = make_batch_scratch(road, width), np.empty(n), np.empty(n)
     root, distances = np.empty(filters.covariances.shape[1:]), np.empty((n, width))
@@ -113,13 +117,13 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
         process_noise(road, filters, mean, noise)
         if not _draw(filters, points, e, root):
             fill_vector(mean, np.nan)  # detected by the update, which resets the filter
-        advance_states(road, states, inputs[k], scratch)
-        project_states(road, states, filters.is_box)
+        advance_states(road, arz, states, inputs[k], scratch)
+        project_states(road, arz, states, filters.is_box)
         _gather(filters, points, e, distances, shift)
         for i in range(n):
             covariance[i, i] += noise[i]
             mean[i] = states[i, 0] + shift[i] * filters.units[i]
-        project(road, mean, filters.is_box)
+        project(road, arz, mean, filters.is_box)
         points.moved[e] = True
 
 
@@ -173,24 +177,17 @@ def _gather(
 
 
 @kernel
-def update(
-    bundle: Bundle,
-    episodes: IntArray,
-    observed: BoolArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-) -> None:
+def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
     """Update by measurements; see `Estimator.update`."""
-    road, filters, points = bundle.parts
+    _, _, channels, filters, points = bundle.parts
     variances = np.empty(filters.covariances.shape[2])
-    rows = np.empty(road.row_first.size, np.int64)
+    indices = np.empty(channels.first.size, np.int64)
     for k in range(episodes.size):
-        e, seen, sound = episodes[k], rows_seen(observed[k], rows), True
+        e, seen, sound = episodes[k], find_observed(measured.observed[k], indices), True
         for innovations in filters.innovations[e]:
             fill_vector(innovations, 0.0)
         if seen.size > 0:
-            sound = _assimilate(road, filters, points, e, seen, values[k], sigma[k], centre[k])
+            sound = _assimilate(bundle, e, seen, measured, k)
         mean, covariance = filters.means[e], filters.covariances[e]
         filters.diverged[e] = not (
             sound and all_finite(mean) and is_covariance(covariance, variances)
@@ -201,24 +198,23 @@ def update(
 
 
 @kernel_part
-def _assimilate(
-    road: RoadArrays,
-    filters: Filters,
-    points: Points,
-    e: int,
-    rows: IntArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
-) -> bool:
-    """Update an episode by the m `rows` that are observed, and write innovations.
+def _assimilate(bundle: Bundle, e: int, seen: IntArray, measured: Measurement, k: int) -> bool:
+    """Update episode e, the k-th one that was measured, and write innovations.
+
+    Args:
+        bundle: Road, model, channels, `Filters` and `Points`.
+        e: The episode.
+        seen: `(m,)` channels that are observed.
+        measured: The measurement.
+        k: Index of the episode in it.
 
     Returns:
         Whether the covariances of the points and of the measurements are definite.
     """
+    road, arz, _, filters, points = bundle.parts
     states, mean, covariance = points.states[e], filters.means[e], filters.covariances[e]
     n, width = states.shape
-    size, residual = 2 * rows.size, padded(n)  # the column of residuals
+    size, residual = 2 * seen.size, padded(n)  # the column of residuals
     distances, shift = np.empty((n, width)), np.empty(n)
     if points.moved[e]:
         for i in range(n):
@@ -228,14 +224,12 @@ def _assimilate(
     else:
         if not _draw(filters, points, e, covariance.copy()):
             return False
-        project_states(road, states, filters.is_box)
+        project_states(road, arz, states, filters.is_box)
         _gather(filters, points, e, distances, shift)
     points.moved[e] = False
     outputs, output_shift = np.empty((size, width)), np.empty(size)
     joint, cross = np.empty((size, size)), np.zeros((size, residual + 8))
-    noise = _measure(
-        road, filters, points, e, rows, values, sigma, centre, outputs, output_shift, cross
-    )
+    noise = _measure(bundle, e, seen, measured, k, outputs, output_shift, cross)
     products(outputs, outputs, True, joint)
     products(outputs, distances, False, cross)
     for i in range(size):
@@ -245,7 +239,7 @@ def _assimilate(
         joint[i, i] += noise[i]
         for j in range(n):
             cross[i, j] = points.weight * cross[i, j] + points.surplus * output_shift[i] * shift[j]
-        filters.innovations[e, rows[i // 2], i % 2] = cross[i, residual] / np.sqrt(joint[i, i])
+        filters.innovations[e, seen[i // 2], i % 2] = cross[i, residual] / np.sqrt(joint[i, i])
         if not joint[i, i] >= noise[i] * (1.0 - 1e-9):
             return False
     if not factor(joint):
@@ -258,31 +252,30 @@ def _assimilate(
             total += cross[r, i] * cross[r, residual]
         mean[i] = states[i, 0] + total * filters.units[i]
     downdate(covariance, cross)
-    project(road, mean, filters.is_box)
+    project(road, arz, mean, filters.is_box)
     return True
 
 
 @kernel_part
 def _measure(
-    road: RoadArrays,
-    filters: Filters,
-    points: Points,
+    bundle: Bundle,
     e: int,
-    rows: IntArray,
-    values: FloatArray,
-    sigma: FloatArray,
-    centre: FloatArray,
+    seen: IntArray,
+    measured: Measurement,
+    k: int,
     outputs: FloatArray,
     shift: FloatArray,
     cross: FloatArray,
 ) -> FloatArray:
     """Write distances of what points measure `(2 m, width)`, and residuals; return noise."""
-    units, noise = (filters.units[0], road.second_scale), np.empty(outputs.shape[0])
+    _, arz, channels, filters, points = bundle.parts
+    values, sigma, centre = measured.values[k], measured.sigma[k], measured.centre[k]
+    units, noise = (filters.units[0], arz.second_scale), np.empty(outputs.shape[0])
     work, residual = np.empty(outputs.shape[1]), cross.shape[1] - 8
-    for r in range(rows.size):
-        m = rows[r]
+    for r in range(seen.size):
+        m = seen[r]
         density, second = outputs[2 * r], outputs[2 * r + 1]
-        measure_row(road, m, points.states[e], centre, density, second, work)
+        measure_channel(arz, channels, m, points.states[e], centre, density, second, work)
         for q in range(2):
             i, number = 2 * r + q, outputs[2 * r + q]
             first = number[0]
@@ -290,7 +283,7 @@ def _measure(
             cross[i, residual] = (values[m, q] - first) / units[q] - shift[i]
             noise[i] = (sigma[m, q] / units[q]) ** 2
         counted = 0.0
-        for s in range(road.row_first[m], road.row_first[m] + road.row_span[m]):
+        for s in range(channels.first[m], channels.first[m] + channels.span[m]):
             counted += filters.means[e, 2 * s]
-        noise[2 * r] += filters.count_variance[m] * counted / road.row_span[m] ** 2
+        noise[2 * r] += filters.count_variance[m] * counted / channels.span[m] ** 2
     return noise

@@ -33,7 +33,8 @@ from dptse_env.estimators.linalg import (
     solve,
 )
 from dptse_env.estimators.linalg import factor as cholesky
-from dptse_env.model.network import RoadArrays
+from dptse_env.model.arrays import Channels
+from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import copy_matrix, copy_vector, fill_vector, kernel_part
 
@@ -113,25 +114,25 @@ class Columns(NamedTuple):
 
 
 @kernel_part
-def make_iterate(n_stages: int, width: int, n_rows: int) -> Iterate:
+def make_iterate(n_stages: int, width: int, n_channels: int) -> Iterate:
     """Return a trajectory of zeros without defects and residuals."""
     shape = n_stages, width
-    residuals = np.zeros((n_stages, 2 * n_rows))
+    residuals = np.zeros((n_stages, 2 * n_channels))
     return Iterate(np.zeros(shape), np.zeros(shape), residuals, np.zeros(shape))
 
 
 @kernel_part
-def make_factor(n_stages: int, n: int, n_rows: int, size: int, width: int) -> Factor:
+def make_factor(n_stages: int, n: int, n_channels: int, size: int, width: int) -> Factor:
     """Allocate a factor for windows of up to L stages, and working space.
 
     Args:
         n_stages: L.
         n: Components of a state.
-        n_rows: M.
+        n_channels: M.
         size: Components that a row may depend on.
         width: Length of padded rows.
     """
-    n_updates = n + 2 * n_rows
+    n_updates = n + 2 * n_channels
     return Factor(
         np.zeros(1, np.int64),
         np.zeros((n_stages, n), np.int64),
@@ -151,7 +152,9 @@ def make_factor(n_stages: int, n: int, n_rows: int, size: int, width: int) -> Fa
 
 
 @kernel_part
-def factorise(road: RoadArrays, window: Window, active_set: IntArray, factor: Factor) -> bool:
+def factorise(
+    road: Road, channels: Channels, window: Window, active_set: IntArray, factor: Factor
+) -> bool:
     """Filter covariances from the first stage whose active set changed; return success."""
     n, n_stages, start = window.lower.size, window.targets.shape[0], 0
     while start < factor.length[0] and _is_same(active_set[start], factor.active_set[start]):
@@ -170,7 +173,10 @@ def factorise(road: RoadArrays, window: Window, active_set: IntArray, factor: Fa
         if t == n_stages - 1:
             copy_matrix(P, factor.before)
         factor.length[0], factor.n_updates[t] = t, 0
-        if not (_condition(factor, t, active_set[t]) and _update_by_rows(road, window, factor, t)):
+        if not (
+            _condition(factor, t, active_set[t])
+            and _update_by_channels(channels, window, factor, t)
+        ):
             return False
     factor.length[0] = n_stages
     return True
@@ -198,13 +204,13 @@ def _condition(factor: Factor, t: int, active_set: IntArray) -> bool:
 
 
 @kernel_part
-def _update_by_rows(road: RoadArrays, window: Window, factor: Factor, t: int) -> bool:
-    """Update a stage's covariance by its observed rows; return success."""
+def _update_by_channels(channels: Channels, window: Window, factor: Factor, t: int) -> bool:
+    """Update a stage's covariance by what is observed; return success."""
     P, work, u = factor.covariances[t], factor.vectors, factor.n_active[t]
-    for m in range(road.row_first.size):
+    for m in range(channels.first.size):
         if not window.observed[t, m]:
             continue
-        first, size, noise = 2 * road.row_first[m], 2 * road.row_span[m], window.noise[t, m]
+        first, size, noise = 2 * channels.first[m], 2 * channels.span[m], window.noise[t, m]
         rows = window.weights[t, m, :, :size]
         if not pair_update(P, first, rows, noise, work):
             return False
@@ -231,7 +237,7 @@ def _is_same(one: IntArray, other: IntArray) -> bool:
 
 @kernel_part
 def sweep(
-    road: RoadArrays,
+    road: Road,
     window: Window,
     factor: Factor,
     start: int,
@@ -260,7 +266,7 @@ def sweep(
 
 @kernel_part
 def _sweep_forwards(
-    road: RoadArrays,
+    road: Road,
     window: Window,
     factor: Factor,
     start: int,
@@ -269,7 +275,7 @@ def _sweep_forwards(
     step: FloatArray,
 ) -> None:
     """Write a filter's means of the step, and the weighted residuals of its updates."""
-    n_factors = window.lower.size - 2 * road.jam.size
+    n_factors = window.lower.size - 2 * road.n_segments
     for t in range(start):
         step[t, :] = 0.0
         factor.weighted_residuals[t, :] = 0.0
@@ -294,7 +300,7 @@ def _sweep_forwards(
 
 @kernel_part
 def _sweep_backwards(
-    road: RoadArrays,
+    road: Road,
     window: Window,
     factor: Factor,
     start: int,
@@ -309,7 +315,7 @@ def _sweep_backwards(
         if t < step.shape[0] - 1:
             # l = A' l and step = mean + P l (Bryson and Frazier, 1963)
             blocks, by_factor = window.blocks[t], window.by_factor[t]
-            apply_transposed(road, blocks, by_factor, n - 2 * road.jam.size, costate, adjoint)
+            apply_transposed(road, blocks, by_factor, n - 2 * road.n_segments, costate, adjoint)
             add_product(factor.covariances[t], adjoint, step[t])
             copy_vector(adjoint, costate)
         for i in range(n if from_gradient and t >= start else 0):
@@ -324,7 +330,7 @@ def _sweep_backwards(
 
 @kernel_part
 def solve_on_active_set(
-    road: RoadArrays,
+    road: Road,
     window: Window,
     factor: Factor,
     columns: Columns,
@@ -339,6 +345,7 @@ def solve_on_active_set(
 
     Args:
         road: The road.
+        channels: What is measured.
         window: The window.
         factor: Its factor without components at bounds.
         columns: Known columns, to which others are added; members and multipliers are written.
@@ -397,7 +404,7 @@ def _dot(x: FloatArray, y: FloatArray) -> float:
 
 
 @kernel_part
-def evaluate(road: RoadArrays, window: Window, iterate: Iterate) -> None:
+def evaluate(road: Road, channels: Channels, window: Window, iterate: Iterate) -> None:
     """Write the defects, residuals and gradient of an iterate's trajectory."""
     z, defects, descent, n = (
         iterate.z,
@@ -405,7 +412,11 @@ def evaluate(road: RoadArrays, window: Window, iterate: Iterate) -> None:
         iterate.negative_gradient,
         window.lower.size,
     )
-    n_factors, adjoint, weighted = n - 2 * road.jam.size, np.empty(z.shape[1]), np.empty(z.shape[1])
+    n_factors, adjoint, weighted = (
+        n - 2 * road.n_segments,
+        np.empty(z.shape[1]),
+        np.empty(z.shape[1]),
+    )
     for i in range(n):  # d_0 = m - z_0
         defects[0, i] = window.arrival[i] - z[0, i]
         descent[0, i] = defects[0, i] / window.arrival_variance[i]
@@ -421,10 +432,10 @@ def evaluate(road: RoadArrays, window: Window, iterate: Iterate) -> None:
             descent[t - 1, i] -= adjoint[i]
     for t in range(z.shape[0]):
         u = 0
-        for m in range(road.row_first.size):
+        for m in range(channels.first.size):
             if not window.observed[t, m]:
                 continue
-            first, size = 2 * road.row_first[m], 2 * road.row_span[m]
+            first, size = 2 * channels.first[m], 2 * channels.span[m]
             for q in range(2):  # r = y - c' z_t adds c r / R
                 row, r = window.weights[t, m, q], window.targets[t, m, q]
                 for i in range(size):
@@ -435,23 +446,23 @@ def evaluate(road: RoadArrays, window: Window, iterate: Iterate) -> None:
 
 
 @kernel_part
-def write_diagonal(road: RoadArrays, window: Window, diagonal: FloatArray) -> None:
+def write_diagonal(road: Road, channels: Channels, window: Window, diagonal: FloatArray) -> None:
     """Write the diagonal `(L, padded)` of H, P_0^-1 or Q^-1 plus A' Q^-1 A plus C' R^-1 C."""
-    n, n_stages = 2 * road.jam.size, diagonal.shape[0]
+    n, n_stages = 2 * road.n_segments, diagonal.shape[0]
     for t in range(n_stages):
         variance = window.arrival_variance if t == 0 else window.process_variance[t - 1]
         for i in range(variance.size):
             diagonal[t, i] = 1.0 / variance[i]
-        for m in range(road.row_first.size):
+        for m in range(channels.first.size):
             if not window.observed[t, m]:
                 continue
             for q in range(2):
-                for i in range(2 * road.row_span[m]):
+                for i in range(2 * channels.span[m]):
                     weight = window.weights[t, m, q, i]
-                    diagonal[t, 2 * road.row_first[m] + i] += weight**2 / window.noise[t, m, q]
+                    diagonal[t, 2 * channels.first[m] + i] += weight**2 / window.noise[t, m, q]
     for t in range(n_stages - 1):
         out, K = diagonal[t], window.process_variance[t]
-        for c in range(road.jam.size):
+        for c in range(road.n_segments):
             for slot in range(road.degree[c]):
                 b, block = road.neighbours[c, slot], window.blocks[t, c, slot]
                 out[2 * b] += block[0] ** 2 / K[2 * c] + block[2] ** 2 / K[2 * c + 1]
@@ -464,7 +475,12 @@ def write_diagonal(road: RoadArrays, window: Window, diagonal: FloatArray) -> No
 
 @kernel_part
 def minimise(
-    road: RoadArrays, window: Window, factor: Factor, active_set: IntArray, z: FloatArray
+    road: Road,
+    channels: Channels,
+    window: Window,
+    factor: Factor,
+    active_set: IntArray,
+    z: FloatArray,
 ) -> int:
     """Replace a trajectory by the minimiser; return how, or `UNSOLVED`.
 
@@ -472,28 +488,33 @@ def minimise(
 
     Args:
         road: The road.
+        channels: What is measured.
         window: The window.
         factor: Its factor without components at bounds; another one afterwards.
         active_set: `(L, padded)` a guess, replaced.
         z: `(L, padded)` a guess of the trajectory, replaced.
     """
-    n_stages, width, n_rows = *z.shape, road.row_first.size
-    current, trial = make_iterate(n_stages, width, n_rows), make_iterate(n_stages, width, n_rows)
+    n_stages, width, n_channels = *z.shape, channels.first.size
+    current, trial = (
+        make_iterate(n_stages, width, n_channels),
+        make_iterate(n_stages, width, n_channels),
+    )
     diagonal = np.ones((n_stages, width))
-    write_diagonal(road, window, diagonal)
+    write_diagonal(road, channels, window, diagonal)
     _clip(window.lower, window.upper, z, 0.0, z, current.z)
-    evaluate(road, window, current)
-    if _find_active_set(road, window, factor, diagonal, active_set, current, trial):
+    evaluate(road, channels, window, current)
+    if _find_active_set(road, channels, window, factor, diagonal, active_set, current, trial):
         copy_matrix(trial.z, z)
         return ACTIVE_SET
-    if _projected_newton(road, window, factor, diagonal, active_set, current, trial, z):
+    if _projected_newton(road, channels, window, factor, diagonal, active_set, current, trial, z):
         return NEWTON
     return UNSOLVED
 
 
 @kernel_part
 def _find_active_set(
-    road: RoadArrays,
+    road: Road,
+    channels: Channels,
     window: Window,
     factor: Factor,
     diagonal: FloatArray,
@@ -524,13 +545,13 @@ def _find_active_set(
         return False
     _clip(lower, upper, current.z, 1.0, step, trial.z)
     for _ in range(CORRECTIONS):
-        evaluate(road, window, trial)
+        evaluate(road, channels, window, trial)
         if _natural_residual(lower, upper, diagonal, trial) <= REFINED:
             return True
         sweep(road, window, factor, 0, trial, True, step)
         solve_on_active_set(road, window, factor, columns, trial.z, active_set, step)
         _clip(lower, upper, trial.z, 1.0, step, trial.z)
-    evaluate(road, window, trial)
+    evaluate(road, channels, window, trial)
     return _natural_residual(lower, upper, diagonal, trial) <= ACCEPTED
 
 
@@ -571,7 +592,8 @@ def _revise_active_set(
 
 @kernel_part
 def _projected_newton(
-    road: RoadArrays,
+    road: Road,
+    channels: Channels,
     window: Window,
     factor: Factor,
     diagonal: FloatArray,
@@ -598,17 +620,19 @@ def _projected_newton(
                 at_upper = current.z[t, i] >= upper[i] and current.negative_gradient[t, i] > 0.0
                 active_set[t, i] = int(at_upper) - int(at_lower)
         is_near, before, length, found = residual <= NEAR, residual, 1.0, False
-        if not _newton_step(road, window, factor, active_set, current, is_near, step):
+        if not _newton_step(road, channels, window, factor, active_set, current, is_near, step):
             return False
         for halving in range(HALVINGS + 1):
             if halving == HALVINGS:
                 length = _step_to_bound(lower, upper, current.z, step, active_set)
                 while length < 0.0:
-                    if not _newton_step(road, window, factor, active_set, current, is_near, step):
+                    if not _newton_step(
+                        road, channels, window, factor, active_set, current, is_near, step
+                    ):
                         return False
                     length = _step_to_bound(lower, upper, current.z, step, active_set)
             _clip(lower, upper, current.z, length, step, trial.z)
-            evaluate(road, window, trial)
+            evaluate(road, channels, window, trial)
             residual = _natural_residual(lower, upper, diagonal, trial)
             # Near the minimum, rounding decides whether the objective decreases.
             found = (is_near and residual <= 0.5 * before) or _decreases(lower.size, current, trial)
@@ -627,7 +651,8 @@ def _projected_newton(
 
 @kernel_part
 def _newton_step(
-    road: RoadArrays,
+    road: Road,
+    channels: Channels,
     window: Window,
     factor: Factor,
     active_set: IntArray,
@@ -636,7 +661,7 @@ def _newton_step(
     step: FloatArray,
 ) -> bool:
     """Write the step to the minimum on an active set; return success."""
-    sound = factorise(road, window, active_set, factor)
+    sound = factorise(road, channels, window, active_set, factor)
     if sound:
         sweep(road, window, factor, 0, iterate, is_near, step)
     return sound

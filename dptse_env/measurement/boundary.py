@@ -106,11 +106,8 @@ class PrivateBoundary(NominalBoundary):
     def __init__(self, task: Task, traffic: Traffic, model: ARZModel) -> None:
         """Prepare for episodes without any release yet."""
         super().__init__(task, traffic, model)
-        self._least_density = 1.0 / task.length[task.n_rows :]
-        layout = model.layout
-        self._jam_density = np.empty(model.n_boundaries)
-        self._jam_density[layout.entry_boundaries] = model.entry_jam_density
-        self._jam_density[layout.exit_boundaries] = model.exit_jam_density
+        self._least_density = 1.0 / task.channels.length[task.n_on_road :]
+        self._jam_density = model.arz.jam[model.n_segments :]
         self._has_release: BoolArray = np.zeros(task.n_episodes, dtype=bool)
         self._inputs = np.empty((task.n_episodes, model.n_inputs))
 
@@ -128,7 +125,7 @@ class PrivateBoundary(NominalBoundary):
 
     def update(self, episodes: IntArray, measured: Measurement) -> None:
         """Turn releases into inputs, within what the road can hold."""
-        model, released = self.model, measured.values[:, self.task.n_rows :]
+        model, released = self.model, measured.values[:, self.task.n_on_road :]
         # Not np.clip, which takes several times as long on so few numbers.
         density = np.minimum(np.maximum(released[..., 0], 0.0), self._jam_density)
         speed = released[..., 1]
@@ -199,14 +196,13 @@ def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
     Vehicles enter at free speed; behind the exits traffic flows freely, at the density of the flow
     that reaches them. Incidents are not considered.
     """
-    layout, v_f = model.layout, model.parameters.free_flow_speed
+    road, v_f = model.road, model.parameters.free_flow_speed
     flows = nominal_flows(corridor, np.arange(corridor.duration + 1))
     inputs = np.empty((len(flows), model.n_inputs))
-    inputs[:, layout.entry_inputs[0]] = flows[:, 0]  # no ramp lies ahead of the first segment
-    inputs[:, layout.entry_inputs[1:]] = flows[:, layout.entries[1:]]
-    inputs[:, layout.entry_inputs + 1] = v_f
-    leaving = flows[:, layout.exits]
-    inputs[:, layout.exit_inputs] = free_flow_density(model, leaving, model.exit_jam_density)
+    inputs[:, road.entry_inputs] = flows[:, road.entries]  # no ramp lies ahead of the first segment
+    inputs[:, road.entry_inputs + 1] = v_f
+    jam = model.arz.jam[road.exit_cells]
+    inputs[:, road.exit_inputs] = free_flow_density(model, flows[:, road.exits], jam)
     return inputs
 
 

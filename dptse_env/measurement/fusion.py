@@ -62,8 +62,10 @@ class Fusion:
         self.settings, self.share = settings, share
         self.releases_flow = task.releases_flow
         self._queries = queries = slice(0, task.queries.n_options)
-        self._length, self._limit = task.length[queries], task.limit[queries]
-        self._weights = task.rows.weights[queries].T  # (S, G)
+        self._length = task.channels.length[queries]
+        self._limit = task.corridor.road.limits[task.channels.first[queries]]
+        covers = task.covers[queries, : task.corridor.road.n_segments]
+        self._weights = (covers / task.channels.span[queries, None]).T  # (S, G)
 
     def scaled(self, sigma: FloatArray) -> FloatArray:
         """Return deviations (2,) of a query's noise, scaled to all vehicles."""

@@ -95,7 +95,7 @@ class DetectorErrors:
     def __init__(self, task: Task, detectors: Detectors) -> None:
         """Prepare for episodes."""
         self._detectors, self._columns = detectors, task.sensors
-        self._length, self._releases_flow = task.length[task.sensors], task.releases_flow
+        self._length, self._releases_flow = task.channels.length[task.sensors], task.releases_flow
         self._factor = np.broadcast_to(np.array(detectors.factor, np.float64), task.sensors.shape)
         self._streams: dict[int, np.random.Generator] = {}
 

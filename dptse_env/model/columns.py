@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.model.network import EXIT, LINK, MERGE, RoadArrays
+from dptse_env.model.arrays import ARZ, Channels
 from dptse_env.model.parameters import (
     LARGEST_FACTOR,
     LARGEST_W,
@@ -20,6 +20,7 @@ from dptse_env.model.parameters import (
     VACUUM,
 )
 from dptse_env.model.power import power
+from dptse_env.road import EXIT, LINK, MERGE, Road
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel_part
 
@@ -36,9 +37,9 @@ class BatchScratch(NamedTuple):
 
 
 @kernel_part
-def make_batch_scratch(road: RoadArrays, width: int) -> BatchScratch:
+def make_batch_scratch(road: Road, width: int) -> BatchScratch:
     """Allocate the scratch space for a road and a batch of states."""
-    n = road.jam.size
+    n = road.n_segments
     table = np.empty((5, n, width))
     return BatchScratch(table[0], table[1], table[2], table[3], table[4], np.empty((4, width)))
 
@@ -117,30 +118,30 @@ def _merge(
 
 
 @kernel_part
-def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArray) -> None:
-    v_f, gamma = road.free_flow_speed, road.gamma
+def _flow_out(road: Road, arz: ARZ, scratch: BatchScratch, c: int, inputs: FloatArray) -> None:
+    v_f, gamma = arz.free_flow_speed, arz.gamma
     kind, down, third = road.kind[c], road.parties[c, 1], road.parties[c, 2]
     w, root, demand, flow = scratch.w[c], scratch.root[c], scratch.demand[c], scratch.flow[c]
     supply = scratch.row[2]
     if kind == MERGE:
-        _merge(scratch, c, down, third, road.jam[down], v_f, gamma)
+        _merge(scratch, c, down, third, arz.jam[down], v_f, gamma)
         return
     if kind == EXIT:
-        jam, speed = road.outside_jam[c], scratch.row[0]
-        density = inputs[road.exit[c]]
+        jam, speed = arz.jam[road.exit_cells[road.exit_of[c]]], scratch.row[0]
+        density = inputs[road.exit_inputs[road.exit_of[c]]]
         p = v_f * (max(density, 0.0) / jam) ** gamma if np.isfinite(density) else np.nan
         for j in range(speed.size):
             v = w[j] - p
             speed[j] = 0.0 if v < 0.0 else v
         _supplies(w, root, speed, jam, v_f, gamma, supply)
     else:
-        _supplies(w, root, scratch.speed[down], road.jam[down], v_f, gamma, supply)
+        _supplies(w, root, scratch.speed[down], arz.jam[down], v_f, gamma, supply)
         if kind != LINK:
             share, off = road.share[c], scratch.row[1]
             for j in range(supply.size):
                 supply[j] = supply[j] / (1.0 - share)
             if share > 0.0:
-                _supplies(w, root, scratch.speed[third], road.jam[third], v_f, gamma, off)
+                _supplies(w, root, scratch.speed[third], arz.jam[third], v_f, gamma, off)
                 for j in range(supply.size):
                     branch = off[j] / share
                     supply[j] = branch if branch < supply[j] else supply[j]
@@ -150,22 +151,22 @@ def _flow_out(road: RoadArrays, scratch: BatchScratch, c: int, inputs: FloatArra
 
 @kernel_part
 def _enter(
-    road: RoadArrays, scratch: BatchScratch, e: int, inputs: FloatArray, states: FloatArray
+    road: Road, arz: ARZ, scratch: BatchScratch, e: int, inputs: FloatArray, states: FloatArray
 ) -> None:
     """Add the inflow of an entry from outside; demand that is not served is lost."""
-    v_f, gamma, n = road.free_flow_speed, road.gamma, 2 * road.jam.size
+    v_f, gamma, n = arz.free_flow_speed, arz.gamma, 2 * road.n_segments
     c = road.entries[e]
-    source, w_in = inputs[road.entry[c]], inputs[road.entry[c] + 1]
+    source, w_in = inputs[road.entry_inputs[e]], inputs[road.entry_inputs[e] + 1]
     w, root, supply = scratch.row[0], scratch.row[1], scratch.row[2]
     w[:] = w_in
     root[:] = (w_in / ((1.0 + gamma) * v_f)) ** (1.0 / gamma)
-    _supplies(w, root, scratch.speed[c], road.jam[c], v_f, gamma, supply)
+    _supplies(w, root, scratch.speed[c], arz.jam[c], v_f, gamma, supply)
     rho, psi, demand = states[2 * c], states[2 * c + 1], scratch.row[3]
     demand[:] = source
     if states.shape[0] > n:
         demand *= states[n + e]
     for j in range(supply.size):
-        entered = road.step_ratio[c] * (supply[j] if demand[j] > supply[j] else demand[j])
+        entered = arz.step_ratio[c] * (supply[j] if demand[j] > supply[j] else demand[j])
         rho[j] += entered
         psi[j] += entered * w_in
 
@@ -193,22 +194,22 @@ def _arrive(
 
 @kernel_part
 def advance_states(
-    road: RoadArrays, states: FloatArray, inputs: FloatArray, scratch: BatchScratch
+    road: Road, arz: ARZ, states: FloatArray, inputs: FloatArray, scratch: BatchScratch
 ) -> None:
     """Predict every column of `states` `(n_x, width)` one step ahead under inputs `(n_u,)`."""
-    v_f, gamma, ratio = road.free_flow_speed, road.gamma, road.step_ratio
-    for c in range(road.jam.size):
+    v_f, gamma, ratio = arz.free_flow_speed, arz.gamma, arz.step_ratio
+    for c in range(road.n_segments):
         _tabulate(
-            states[2 * c], states[2 * c + 1], road.jam[c], v_f, gamma,
+            states[2 * c], states[2 * c + 1], arz.jam[c], v_f, gamma,
             scratch.w[c], scratch.speed[c], scratch.demand[c], scratch.root[c],
         )  # fmt: skip
-    for c in range(road.jam.size):
-        _flow_out(road, scratch, c, inputs)
-    for c in range(road.jam.size):
+    for c in range(road.n_segments):
+        _flow_out(road, arz, scratch, c, inputs)
+    for c in range(road.n_segments):
         rho, psi = states[2 * c], states[2 * c + 1]
-        _leave(rho, psi, scratch.flow[c], scratch.w[c], ratio[c], road.relaxation, v_f)
+        _leave(rho, psi, scratch.flow[c], scratch.w[c], ratio[c], arz.relaxation, v_f)
     for e in range(road.entries.size):
-        _enter(road, scratch, e, inputs, states)
+        _enter(road, arz, scratch, e, inputs, states)
     for e in range(road.edges.shape[0]):
         start, end = road.edges[e, 0], road.edges[e, 1]
         part = ratio[end] * road.edge_share[e]
@@ -238,17 +239,17 @@ def _into_box(row: FloatArray, largest: float) -> None:
 
 
 @kernel_part
-def project_states(road: RoadArrays, states: FloatArray, is_box: bool) -> None:
+def project_states(road: Road, arz: ARZ, states: FloatArray, is_box: bool) -> None:
     """Project every column into its bounds, as `ARZModel.project`; a NaN stays NaN."""
-    v_f, gamma = road.free_flow_speed, road.gamma
-    for c in range(road.jam.size):
-        rho, psi, jam = states[2 * c], states[2 * c + 1], road.jam[c]
+    v_f, gamma = arz.free_flow_speed, arz.gamma
+    for c in range(road.n_segments):
+        rho, psi, jam = states[2 * c], states[2 * c + 1], arz.jam[c]
         if is_box:
             _into_box(rho, jam)
             _into_box(psi, jam * v_f)
         else:
             _into_cone(rho, psi, jam, v_f, gamma)
-    for i in range(2 * road.jam.size, states.shape[0]):
+    for i in range(2 * road.n_segments, states.shape[0]):
         row = states[i]
         for j in range(row.size):
             factor = LEAST_FACTOR if row[j] < LEAST_FACTOR else row[j]
@@ -268,7 +269,7 @@ def measured_speeds(
 
 @kernel_part(fastmath={"contract"})
 def _released(
-    road: RoadArrays,
+    arz: ARZ,
     s: int,
     rho_row: FloatArray,
     psi_row: FloatArray,
@@ -276,20 +277,21 @@ def _released(
     out: FloatArray,
 ) -> None:
     """Write flows centred on v_0 [km/h], or measured speeds [km/h] where it is NaN."""
-    jam, v_f = road.jam[s], road.free_flow_speed
+    jam, v_f = arz.jam[s], arz.free_flow_speed
     if np.isnan(v_0):
-        measured_speeds(rho_row, psi_row, jam, v_f, road.gamma, out)
+        measured_speeds(rho_row, psi_row, jam, v_f, arz.gamma, out)
         return
     by_jam = 1.0 / jam
     for j in range(rho_row.size):
         rho = rho_row[j]
         held = 0.0 if rho < 0.0 else rho
-        out[j] = psi_row[j] - rho * (v_f * power(held * by_jam, road.gamma) + v_0)
+        out[j] = psi_row[j] - rho * (v_f * power(held * by_jam, arz.gamma) + v_0)
 
 
 @kernel_part(fastmath={"contract"})
-def measure_row(
-    road: RoadArrays,
+def measure_channel(
+    arz: ARZ,
+    channels: Channels,
     m: int,
     states: FloatArray,
     centre: FloatArray,
@@ -297,22 +299,23 @@ def measure_row(
     second: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Write both numbers of row m of a measurement for each state, as `ARZModel.measure`.
+    """Write both numbers of channel m for each state, as `ARZModel.measure`.
 
     Args:
-        road: The road.
-        m: Index of the row.
+        arz: The model.
+        channels: What is measured.
+        m: Index of the channel.
         states: `(n_x, width)`, a state per column.
         centre: `(S,)` speeds that flows are centred on [km/h]; NaN where speeds are measured.
-        density: `(width,)` output, the mean density of the row's segments [veh/km].
+        density: `(width,)` output, the mean density of the channel's segments [veh/km].
         second: `(width,)` output, the mean of their centred flows [veh/h] or speeds [km/h].
         work: `(width,)` scratch.
     """
-    first, span = road.row_first[m], road.row_span[m]
+    first, span = channels.first[m], channels.span[m]
     part = 1.0 / span
     for s in range(first, first + span):
         rho, psi = states[2 * s], states[2 * s + 1]
-        _released(road, s, rho, psi, centre[s], work)
+        _released(arz, s, rho, psi, centre[s], work)
         if s == first:
             for j in range(rho.size):
                 density[j], second[j] = part * rho[j], part * work[j]

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dptse_env.model.network import MeasurementRows, RoadArrays, RoadNetwork, make_layout
+from dptse_env.model.arrays import ARZ, Channels
 from dptse_env.model.parameters import (
     LARGEST_FACTOR,
     LARGEST_W,
@@ -27,6 +27,7 @@ from dptse_env.model.parameters import (
     Bounds,
 )
 from dptse_env.model.step import jacobians, next_states, write_inputs
+from dptse_env.road import Road
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import non_negative
 
@@ -35,120 +36,111 @@ class ARZModel:
     """Second-order macroscopic traffic flow, Godunov scheme, proportional merge, FIFO diverge.
 
     Args:
-        network: The road.
+        road: The road.
         parameters: Parameters of the model; each cell's jam density follows its lanes.
         time_step: T [s].
         reference_speed: v_0 [km/h], where sensors release the centred flow rho (v - v_0) [veh/h];
             None where they release the speed. A release may have a centre of its own for each
             segment in its place.
-        rows: What a measurement may cover; None for single segments.
+        channels: What is measured, on segments; None for each of them by itself.
         demand_states: Whether the state has a factor on the demand of each entry.
 
     Attributes:
-        layout: Cells of the road and their connections.
         n_segments: Segments S.
         n_demand_states: Demand factors E in the state: 1 + I or 0.
         n_states: Components n_x of a state, 2 S + E.
         n_inputs: Components n_u of the inputs, 3 + 2 I + O.
         n_boundaries: Boundary cells R.
+        arz: Numbers of the model for kernels.
         jam_density: Jam density of each segment, shape (S,) [veh/km].
-        entry_jam_density: That of the boundary cells before the entries, shape (1 + I,).
-        exit_jam_density: That of the boundary cells after the exits, shape (1 + O,).
         largest_speed: Largest speed and w of a physical state, 1.1 v_f [km/h].
         density_scale: rho_m of the mainline, the unit of every normalised density [veh/km].
         speed_scale: v_f, the unit of speeds [km/h].
         state_scale: Units of normalised states: rho_m, rho_m v_f, 1 for demand factors, (n_x,).
-        measurement_scale: Units of the two numbers of a row of a measurement.
+        measurement_scale: Units of the two numbers of a channel.
 
     Raises:
-        ValueError: The network is impossible, the reference speed is negative or not finite, or
-            rows cover several segments where mean speeds are released, which have no sum. The
+        ValueError: A channel leaves the segments, the reference speed is negative or not finite, or
+            a channel covers several segments where mean speeds are released, which have no sum. The
             dynamics, not the constructor, refuse a time step that violates the CFL condition.
     """
 
     def __init__(
         self,
-        network: RoadNetwork,
+        road: Road,
         parameters: ARZParameters,
         time_step: float = 1.0,
         reference_speed: float | None = None,
-        rows: MeasurementRows | None = None,
+        channels: Channels | None = None,
         demand_states: bool = False,
     ) -> None:
         """Derive what the equations need."""
-        self.network, self.parameters, self.time_step = network, parameters, time_step
-        self.layout = layout = make_layout(network)
-        self.n_segments = layout.n_segments
-        self.n_demand_states = layout.entries.size if demand_states else 0
+        self.road, self.parameters, self.time_step = road, parameters, time_step
+        self.n_segments = road.n_segments
+        self.n_demand_states = road.entries.size if demand_states else 0
         self.n_states = 2 * self.n_segments + self.n_demand_states
-        self.n_inputs, self.n_boundaries = layout.n_inputs, layout.n_boundaries
+        self.n_inputs, self.n_boundaries = road.n_inputs, road.beside.size
         per_lane = parameters.jam_density / parameters.lanes
-        self.jam_density = per_lane * layout.lanes
-        self.entry_jam_density = per_lane * layout.entry_lanes
-        self.exit_jam_density = per_lane * layout.exit_lanes
         self.largest_speed = LARGEST_W * parameters.free_flow_speed
         # The scale of the mainline for all cells, so that equal numbers have an equal meaning.
-        self.density_scale = per_lane * max(network.segment_lanes[: network.n_mainline])
+        self.density_scale = per_lane * float(road.lanes[: road.n_mainline].max())
         self.speed_scale = parameters.free_flow_speed
         pair = [self.density_scale, self.density_scale * self.speed_scale]
         factors = np.ones(self.n_demand_states)
         self.state_scale: FloatArray = np.append(np.tile(pair, self.n_segments), factors)
 
-        self.rows = rows or MeasurementRows.single(self.n_segments)
-        if reference_speed is None and not (self.rows.span == 1).all():
-            raise ValueError("model.rows must be single segments where mean speeds are released")
+        self.channels = channels or Channels.of_segments(road)
+        first, span = self.channels.first, self.channels.span
+        if not ((first >= 0) & (span >= 1) & (first + span <= self.n_segments)).all():
+            raise ValueError(f"model.channels must cover segments in 0..{self.n_segments - 1}")
+        if reference_speed is None and not (span == 1).all():
+            raise ValueError("model.channels must be segments where mean speeds are released")
         self.reference_speed: float | None = None
         second = self.speed_scale
         if reference_speed is not None:
             self.reference_speed = non_negative("model.reference_speed", reference_speed)
             second = self.density_scale * self.speed_scale
         self.measurement_scale: FloatArray = np.array([self.density_scale, second])
+        step_ratio = time_step / SECONDS_PER_HOUR / road.lengths[: self.n_segments]
+        self.arz = ARZ(
+            free_flow_speed=float(parameters.free_flow_speed),
+            gamma=float(parameters.gamma),
+            step_ratio=step_ratio,
+            relaxation=float(time_step / parameters.relaxation_time),
+            jam=per_lane * road.lanes,
+            term_weight=step_ratio[road.terms[:, 0]] * road.term_share,
+            second_scale=float(second),
+        )
+        self.jam_density = self.arz.jam[: self.n_segments]
 
-    @cached_property
-    def road(self) -> RoadArrays:
-        """The model as arrays and numbers, for kernels.
+    @property
+    def dynamics(self) -> tuple[Road, ARZ, Channels]:
+        """Road, numbers of the model and channels, for kernels that step the model.
 
         Raises:
             ValueError: The time step violates the CFL condition.
         """
         self.require_time_step()
-        layout, n = self.layout, self.n_segments
-        entry, leave = np.full((2, n), -1, dtype=np.int64)
-        entry[layout.entries] = layout.entry_inputs
-        leave[layout.exits] = layout.exit_inputs
-        outside_jam = np.zeros(n)
-        outside_jam[layout.exits] = self.exit_jam_density
-        step_ratio = self.time_step / SECONDS_PER_HOUR / layout.lengths
-        neighbours, (terms, weights) = layout.neighbours(), layout.terms()
-        return RoadArrays(
-            free_flow_speed=float(self.parameters.free_flow_speed),
-            gamma=float(self.parameters.gamma),
-            step_ratio=step_ratio,
-            relaxation=float(self.time_step / self.parameters.relaxation_time),
-            jam=self.jam_density,
-            outside_jam=outside_jam,
-            kind=layout.kind,
-            parties=layout.parties,
-            share=layout.share,
-            entry=entry,
-            entries=layout.entries,
-            exit=leave,
-            edges=layout.edges,
-            edge_share=layout.edge_shares,
-            neighbours=neighbours,
-            degree=(neighbours >= 0).sum(axis=1, dtype=np.int64),
-            terms=terms,
-            term_weight=step_ratio[terms[:, 0]] * weights,
-            second_scale=float(self.measurement_scale[1]),
-            row_first=self.rows.first,
-            row_span=self.rows.span,
-        )
+        return self.road, self.arz, self.channels
+
+    def averages(self, values: FloatArray) -> FloatArray:
+        """Averages `(n, M, 2)` over the segments of each channel of values `(n, S, 2)`."""
+        if (self.channels.span == 1).all():
+            return values[:, self.channels.first]
+        averages: FloatArray = np.einsum("ms,nsk->nmk", self.averaging, values)
+        return averages
+
+    @cached_property
+    def averaging(self) -> FloatArray:
+        """Weights of the segments in each channel, shape (M, S): 1 / span of those it covers."""
+        weights: FloatArray = self.channels.covers(self.n_segments) / self.channels.span[:, None]
+        return weights
 
     def require_time_step(self) -> None:
         """Raise ``ValueError`` where the time step violates the CFL condition on a segment."""
-        lengths, n = self.network.segment_lengths, self.network.n_mainline
-        field = "segment_length" if min(lengths) == min(lengths[:n]) else "ramp_length"
-        self.parameters.require_time_step(self.time_step, min(lengths), field)
+        lengths, n = self.road.lengths[: self.n_segments], self.road.n_mainline
+        field = "segment_length" if lengths.min() == lengths[:n].min() else "ramp_length"
+        self.parameters.require_time_step(self.time_step, float(lengths.min()), field)
 
     # States -------------------------------------------------------------------------------------
 
@@ -226,14 +218,16 @@ class ARZModel:
     def step(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """States `(n, n_x)` one time step later under inputs `(n, n_u)` (paper, eq. 1a and 1b)."""
         after = np.empty(states.shape)
-        next_states(self.road, np.ascontiguousarray(states), np.ascontiguousarray(inputs), after)
+        road, arz, _ = self.dynamics
+        next_states(road, arz, np.ascontiguousarray(states), np.ascontiguousarray(inputs), after)
         return after
 
     def jacobian(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """Analytic derivative of `step` by the state, `(n, n_x, n_x)`."""
         derivatives = np.zeros((*states.shape, self.n_states))
         states, inputs = np.ascontiguousarray(states), np.ascontiguousarray(inputs)
-        jacobians(self.road, states, inputs, derivatives)
+        road, arz, _ = self.dynamics
+        jacobians(road, arz, states, inputs, derivatives)
         return derivatives
 
     def boundary_inputs(self, density: FloatArray, speed: FloatArray) -> FloatArray:
@@ -243,33 +237,29 @@ class ARZModel:
         of an empty cell is zero for any speed, NaN included. w is clipped to [0, 1.1 v_f], so that
         no input violates the CFL condition.
         """
-        layout, inputs = self.layout, np.empty((density.shape[0], self.n_inputs))
+        inputs = np.empty((density.shape[0], self.n_inputs))
         density, speed = np.ascontiguousarray(density), np.ascontiguousarray(speed)
-        write_inputs(
-            self.parameters.free_flow_speed, self.parameters.gamma, self.entry_jam_density,
-            layout.entry_boundaries, layout.entry_inputs,
-            layout.exit_boundaries, layout.exit_inputs, density, speed, inputs,
-        )  # fmt: skip
+        write_inputs(self.road, self.arz, density, speed, inputs)
         return inputs
 
     # Measurements -------------------------------------------------------------------------------
 
     def measure(self, states: FloatArray, centre: FloatArray | None = None) -> FloatArray:
-        """Density and speed of each row `(n, M, 2)` (paper, eq. 3), density floored in v.
+        """Density and speed of each channel `(n, M, 2)` (paper, eq. 3), density floored in v.
 
         Where flows are released, density and centred flow psi - rho (p(rho) + v_0), averaged over
-        the segments of a row.
+        the segments of a channel.
 
         Args:
             states: `(n, n_x)`.
             centre: v_0 of each segment `(S,)` or `(n, S)` [km/h]; None for the reference speed.
         """
         if self.reference_speed is None:
-            return self.traffic(states)[:, self.rows.first]
+            return self.traffic(states)[:, self.channels.first]
         rho, psi = self.components(states)
         v_0 = self.reference_speed if centre is None else centre
         flow = psi - rho * (self.pressure(rho) + v_0)
-        return self.rows.averages(np.stack([rho, flow], axis=-1))
+        return self.averages(np.stack([rho, flow], axis=-1))
 
     def measurement_matrix(
         self, states: FloatArray, centre: FloatArray | None = None
@@ -283,8 +273,8 @@ class ARZModel:
             by_rho = -(1.0 + self.parameters.gamma) * self.pressure(rho) - v_0
             blocks = _blocks(by_rho, np.ones_like(rho))
         n, S = blocks.shape[:2]
-        matrix = np.zeros((n, self.rows.n_rows, 2, self.n_states))
-        by_segment = np.einsum("ms,nsij->nmisj", self.rows.weights, blocks)
+        matrix = np.zeros((n, self.channels.size, 2, self.n_states))
+        by_segment = np.einsum("ms,nsij->nmisj", self.averaging, blocks)
         matrix[..., : 2 * S] = by_segment.reshape(n, -1, 2, 2 * S)
         return matrix
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.model.network import EXIT, LINK, MERGE, RoadArrays
+from dptse_env.model.arrays import ARZ, Channels
 from dptse_env.model.parameters import (
     LARGEST_FACTOR,
     LARGEST_W,
@@ -30,7 +30,8 @@ from dptse_env.model.parameters import (
     STANDING,
     VACUUM,
 )
-from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.road import EXIT, LINK, MERGE, Road
+from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.kernels import kernel, kernel_part
 
 # Columns of the table of cells: values, then partial derivatives by the cell's rho and psi.
@@ -50,9 +51,9 @@ class Scratch(NamedTuple):
 
 
 @kernel_part
-def make_scratch(road: RoadArrays) -> Scratch:
+def make_scratch(road: Road) -> Scratch:
     """Allocate the working space for a road."""
-    n = road.jam.size
+    n = road.n_segments
     by_factor = np.zeros((road.entries.size, 2))
     return Scratch(np.empty((n, 9)), np.empty((n, 2)), np.zeros((n, 3, 4)), by_factor)
 
@@ -79,11 +80,11 @@ def supply(
 
 
 @kernel_part
-def _tabulate(road: RoadArrays, state: FloatArray, cells: FloatArray) -> None:
+def _tabulate(road: Road, arz: ARZ, state: FloatArray, cells: FloatArray) -> None:
     """Fill the table of cells: w, speed, demand and their derivatives."""
-    v_f, gamma = road.free_flow_speed, road.gamma
-    for c in range(road.jam.size):
-        jam = road.jam[c]
+    v_f, gamma = arz.free_flow_speed, arz.gamma
+    for c in range(road.n_segments):
+        jam = arz.jam[c]
         rho = max(state[2 * c], 0.0)
         psi = max(state[2 * c + 1], 0.0)
         p = pressure(rho, jam, v_f, gamma)
@@ -207,21 +208,24 @@ def _exit(
 
 @kernel_part
 def _flows_out(
-    road: RoadArrays,
+    road: Road,
+    arz: ARZ,
     cells: FloatArray,
     inputs: FloatArray,
     outflow: FloatArray,
     gradient: FloatArray,
 ) -> None:
     """Outflow of every cell and its gradient by the cell's parties."""
-    v_f, gamma = road.free_flow_speed, road.gamma
-    jam, parties = road.jam, road.parties
-    for c in range(jam.size):
+    v_f, gamma = arz.free_flow_speed, arz.gamma
+    jam, parties = arz.jam, road.parties
+    for c in range(road.n_segments):
         kind, b, third = road.kind[c], parties[c, 1], parties[c, 2]
         if kind == LINK:
             flow = _link(cells, c, b, jam[b], v_f, gamma)
         elif kind == EXIT:
-            flow = _exit(cells, c, inputs[road.exit[c]], road.outside_jam[c], v_f, gamma)
+            e = road.exit_of[c]
+            density, outside = inputs[road.exit_inputs[e]], jam[road.exit_cells[e]]
+            flow = _exit(cells, c, density, outside, v_f, gamma)
         elif kind == MERGE:
             flow = _merge(cells, c, b, third, jam[b], v_f, gamma)
         else:
@@ -238,7 +242,8 @@ def _flows_out(
 
 @kernel_part
 def _sources(
-    road: RoadArrays,
+    road: Road,
+    arz: ARZ,
     cells: FloatArray,
     state: FloatArray,
     inputs: FloatArray,
@@ -247,31 +252,32 @@ def _sources(
     by_factor: FloatArray,
 ) -> None:
     """Add inflows from outside; demand that is not served is lost."""
-    n = 2 * road.jam.size
+    n = 2 * road.n_segments
     for e in range(road.entries.size):
         c = road.entries[e]
-        column = road.entry[c]
+        column = road.entry_inputs[e]
         source, w_in = inputs[column], inputs[column + 1]
         if state.size > n:
-            by_factor[e, 0] = road.step_ratio[c] * source
+            by_factor[e, 0] = arz.step_ratio[c] * source
             source *= state[n + e]
-        s, _, by_v = supply(w_in, cells[c, _V], road.jam[c], road.free_flow_speed, road.gamma)
+        s, _, by_v = supply(w_in, cells[c, _V], arz.jam[c], arz.free_flow_speed, arz.gamma)
         if source > s:
             source = s
-            slope = road.step_ratio[c] * by_v
+            slope = arz.step_ratio[c] * by_v
             blocks[c, 0, 0] += slope * cells[c, _V_RHO]
             blocks[c, 0, 1] += slope * cells[c, _V_PSI]
             blocks[c, 0, 2] += slope * w_in * cells[c, _V_RHO]
             blocks[c, 0, 3] += slope * w_in * cells[c, _V_PSI]
             by_factor[e, 0] = 0.0
         by_factor[e, 1] = w_in * by_factor[e, 0]
-        after[2 * c] += road.step_ratio[c] * source
-        after[2 * c + 1] += road.step_ratio[c] * source * w_in
+        after[2 * c] += arz.step_ratio[c] * source
+        after[2 * c + 1] += arz.step_ratio[c] * source * w_in
 
 
 @kernel_part
 def advance(
-    road: RoadArrays,
+    road: Road,
+    arz: ARZ,
     state: FloatArray,
     inputs: FloatArray,
     after: FloatArray,
@@ -282,6 +288,7 @@ def advance(
 
     Args:
         road: The road.
+        arz: The model.
         state: `(n_x,)`, with a demand factor for each entry at its end or without.
         inputs: `(n_u,)`.
         after: `(n_x,)` output, the next state; may be `state` itself.
@@ -290,20 +297,20 @@ def advance(
         scratch: From `make_scratch`; left with the derivatives by the demand factors.
     """
     cells, outflow, gradient = scratch.cells, scratch.outflow, scratch.gradient
-    v_f, ratio, relaxation = road.free_flow_speed, road.step_ratio, road.relaxation
-    _tabulate(road, state, cells)
-    _flows_out(road, cells, inputs, outflow, gradient)
+    v_f, ratio, relaxation = arz.free_flow_speed, arz.step_ratio, arz.relaxation
+    _tabulate(road, arz, state, cells)
+    _flows_out(road, arz, cells, inputs, outflow, gradient)
 
     blocks[:] = 0.0
-    for c in range(road.jam.size):
+    for c in range(road.n_segments):
         rho, psi = state[2 * c], state[2 * c + 1]
         after[2 * c] = rho - ratio[c] * outflow[c, 0]
         after[2 * c + 1] = psi - ratio[c] * outflow[c, 1] + relaxation * (v_f * rho - psi)
         blocks[c, 0, 0] = 1.0
         blocks[c, 0, 2], blocks[c, 0, 3] = relaxation * v_f, 1.0 - relaxation
-    for i in range(2 * road.jam.size, state.size):
+    for i in range(2 * road.n_segments, state.size):
         after[i] = state[i]
-    _sources(road, cells, state, inputs, after, blocks, scratch.by_factor)
+    _sources(road, arz, cells, state, inputs, after, blocks, scratch.by_factor)
 
     for e in range(road.edges.shape[0]):
         start, end = road.edges[e, 0], road.edges[e, 1]
@@ -314,37 +321,37 @@ def advance(
         row, slot = road.terms[m, 0], road.terms[m, 1]
         start, party = road.terms[m, 2], road.terms[m, 3]
         for k in range(4):
-            blocks[row, slot, k] += road.term_weight[m] * gradient[start, party, k]
+            blocks[row, slot, k] += arz.term_weight[m] * gradient[start, party, k]
 
 
 @kernel
 def next_states(
-    road: RoadArrays, states: FloatArray, inputs: FloatArray, after: FloatArray
+    road: Road, arz: ARZ, states: FloatArray, inputs: FloatArray, after: FloatArray
 ) -> None:
     """Write the states (n, n_x) one step after `states` (n, n_x) under `inputs` (n, n_u)."""
     scratch = make_scratch(road)
     blocks = np.empty((*road.neighbours.shape, 4))
     for i in range(states.shape[0]):
-        advance(road, states[i], inputs[i], after[i], blocks, scratch)
+        advance(road, arz, states[i], inputs[i], after[i], blocks, scratch)
 
 
 @kernel
 def jacobians(
-    road: RoadArrays, states: FloatArray, inputs: FloatArray, derivatives: FloatArray
+    road: Road, arz: ARZ, states: FloatArray, inputs: FloatArray, derivatives: FloatArray
 ) -> None:
     """Write the derivatives of a step of `states` into zeros, shape (n, n_x, n_x)."""
     scratch = make_scratch(road)
     blocks = np.empty((*road.neighbours.shape, 4))
     after = np.empty(states.shape[1])
     for i in range(states.shape[0]):
-        advance(road, states[i], inputs[i], after, blocks, scratch)
-        for c in range(road.jam.size):
+        advance(road, arz, states[i], inputs[i], after, blocks, scratch)
+        for c in range(road.n_segments):
             for slot in range(road.degree[c]):
                 b = road.neighbours[c, slot]
                 for k in range(4):
                     derivatives[i, 2 * c + k // 2, 2 * b + k % 2] = blocks[c, slot, k]
-        for j in range(2 * road.jam.size, after.size):
-            e = j - 2 * road.jam.size
+        for j in range(2 * road.n_segments, after.size):
+            e = j - 2 * road.n_segments
             derivatives[i, j, j] = 1.0
             for k in range(2):
                 derivatives[i, 2 * road.entries[e] + k, j] = scratch.by_factor[e, k]
@@ -352,45 +359,33 @@ def jacobians(
 
 @kernel
 def write_inputs(
-    v_f: float,
-    gamma: float,
-    jam: FloatArray,
-    entry_boundaries: IntArray,
-    entry_inputs: IntArray,
-    exit_boundaries: IntArray,
-    exit_inputs: IntArray,
-    density: FloatArray,
-    speed: FloatArray,
-    inputs: FloatArray,
+    road: Road, arz: ARZ, density: FloatArray, speed: FloatArray, inputs: FloatArray
 ) -> None:
     """Write the inputs (n, n_u) of boundary cells; see `ARZModel.boundary_inputs`.
 
     Args:
-        v_f: Free speed [km/h].
-        gamma: Exponent of the pressure.
-        jam: Jam densities of the cells before the entries (1 + I,) [veh/km].
-        entry_boundaries: These cells (1 + I,).
-        entry_inputs: The columns of their demands (1 + I,), before those of w.
-        exit_boundaries: The cells behind the exits (1 + O,).
-        exit_inputs: The columns of their densities (1 + O,).
+        road: The road.
+        arz: The model.
         density: Densities of the boundary cells (n, R) [veh/km].
         speed: Their speeds (n, R) [km/h].
         inputs: Written.
     """
+    v_f, gamma, S = arz.free_flow_speed, arz.gamma, road.n_segments
     for i in range(density.shape[0]):
-        for e in range(exit_boundaries.size):
-            inputs[i, exit_inputs[e]] = density[i, exit_boundaries[e]]
-        for e in range(entry_boundaries.size):
-            rho, demand, w = density[i, entry_boundaries[e]], 0.0, v_f
-            if rho > VACUUM * jam[e]:
-                p = v_f * _rounded_power(rho / jam[e], gamma)
-                w = clip(speed[i, entry_boundaries[e]] + p, 0.0, LARGEST_W * v_f)
+        for e in range(road.exits.size):
+            inputs[i, road.exit_inputs[e]] = density[i, road.exit_cells[e] - S]
+        for e in range(road.entries.size):
+            cell = road.entry_cells[e]
+            rho, jam, demand, w = density[i, cell - S], arz.jam[cell], 0.0, v_f
+            if rho > VACUUM * jam:
+                p = v_f * _rounded_power(rho / jam, gamma)
+                w = clip(speed[i, cell - S] + p, 0.0, LARGEST_W * v_f)
                 if (1.0 + gamma) * p <= w:
                     demand = rho * (w - p)
                 else:
-                    critical = jam[e] * _rounded_power(w / (1.0 + gamma) / v_f, 1.0 / gamma)
+                    critical = jam * _rounded_power(w / (1.0 + gamma) / v_f, 1.0 / gamma)
                     demand = critical * w * (gamma / (1.0 + gamma))
-            inputs[i, entry_inputs[e]], inputs[i, entry_inputs[e] + 1] = demand, w
+            inputs[i, road.entry_inputs[e]], inputs[i, road.entry_inputs[e] + 1] = demand, w
 
 
 @kernel_part
@@ -402,11 +397,9 @@ def _rounded_power(base: float, exponent: float) -> float:
 
 
 @kernel_part
-def normalise(
-    road: RoadArrays, density_scale: float, blocks: FloatArray, by_factor: FloatArray
-) -> None:
+def normalise(arz: ARZ, density_scale: float, blocks: FloatArray, by_factor: FloatArray) -> None:
     """Normalise a step's derivatives: rho by rho_m, psi by rho_m v_f."""
-    v_f = road.free_flow_speed
+    v_f = arz.free_flow_speed
     for s in range(blocks.shape[0]):
         for slot in range(blocks.shape[1]):
             blocks[s, slot, 1] *= v_f
@@ -417,20 +410,20 @@ def normalise(
 
 
 @kernel_part
-def project(road: RoadArrays, state: FloatArray, is_box: bool) -> None:
+def project(road: Road, arz: ARZ, state: FloatArray, is_box: bool) -> None:
     """Project a state into its bounds, as `ARZModel.project`; a NaN stays NaN."""
-    v_f = road.free_flow_speed
-    for c in range(road.jam.size):
-        rho, psi, jam = state[2 * c], state[2 * c + 1], road.jam[c]
+    v_f = arz.free_flow_speed
+    for c in range(road.n_segments):
+        rho, psi, jam = state[2 * c], state[2 * c + 1], arz.jam[c]
         if is_box:
             rho = clip(rho, 0.0, jam)
             low, high = 0.0, jam * v_f
         else:
             rho = clip(rho, LEAST_DENSITY, jam)
-            least_w = max(pressure(rho, jam, v_f, road.gamma), LEAST_W * v_f)
+            least_w = max(pressure(rho, jam, v_f, arz.gamma), LEAST_W * v_f)
             low, high = least_w * rho, LARGEST_W * v_f * rho
         state[2 * c], state[2 * c + 1] = rho, clip(psi, low, high)
-    for i in range(2 * road.jam.size, state.size):
+    for i in range(2 * road.n_segments, state.size):
         state[i] = clip(state[i], LEAST_FACTOR, LARGEST_FACTOR)
 
 
@@ -445,7 +438,7 @@ def clip(value: float, low: float, high: float) -> float:
 
 
 @kernel_part
-def measured(
+def floored_speed(
     rho: float, psi: float, jam: float, v_f: float, gamma: float
 ) -> tuple[float, float, float]:
     """Return a speed [km/h], its density floored, and its derivatives by rho and psi."""
@@ -465,15 +458,16 @@ def _released(
     That is the flow [veh/h] centred on a speed [km/h], or the speed where the centre is NaN.
     """
     if np.isnan(centre):
-        return measured(rho, psi, jam, v_f, gamma)
+        return floored_speed(rho, psi, jam, v_f, gamma)
     p = pressure(rho, jam, v_f, gamma)
     flow = psi - rho * (p + centre)
     return flow, -(1.0 + gamma) * p - centre, 1.0
 
 
 @kernel_part
-def write_row(
-    road: RoadArrays,
+def write_channel(
+    arz: ARZ,
+    channels: Channels,
     units: FloatArray,
     state: FloatArray,
     centre: FloatArray,
@@ -481,27 +475,28 @@ def write_row(
     weights: FloatArray,
     constants: FloatArray,
 ) -> None:
-    """Write both numbers of a row as weights'x + constant, at a state and normalised.
+    """Write both numbers of a channel as weights'x + constant, at a state and normalised.
 
-    They are the mean density of the row's segments, and the mean of their flows centred on a
+    They are the mean density of its segments, and the mean of their flows centred on a
     speed, or of their speeds where the centre is NaN.
 
     Args:
-        road: The road, with the rows' segments.
+        arz: The model.
+        channels: What is measured.
         units: `(n_x,)` units of normalised states [veh/km, veh/h].
-        state: `(n_x,)` where the row is linearised [veh/km, veh/h].
+        state: `(n_x,)` where the channel is linearised [veh/km, veh/h].
         centre: `(S,)` v_0 [km/h] or NaN.
-        m: Index of the row.
-        weights: `(2, >= 2 span)`, written, of the components from 2 `row_first[m]` on.
+        m: Index of the channel.
+        weights: `(2, >= 2 span)`, written, of the components from 2 `first[m]` on.
         constants: `(2,)`, written.
     """
-    first, span, v_f, gamma = road.row_first[m], road.row_span[m], road.free_flow_speed, road.gamma
+    first, span, v_f, gamma = channels.first[m], channels.span[m], arz.free_flow_speed, arz.gamma
     constants[0] = constants[1] = 0.0
     for i in range(span):
         s = first + i
         rho, psi = state[2 * s], state[2 * s + 1]
-        second, by_rho, by_psi = _released(rho, psi, centre[s], road.jam[s], v_f, gamma)
-        part = 1.0 / (span * road.second_scale)
+        second, by_rho, by_psi = _released(rho, psi, centre[s], arz.jam[s], v_f, gamma)
+        part = 1.0 / (span * arz.second_scale)
         weights[0, 2 * i], weights[0, 2 * i + 1] = 1.0 / span, 0.0
         weights[1, 2 * i] = part * by_rho * units[2 * s]
         weights[1, 2 * i + 1] = part * by_psi * units[2 * s + 1]

@@ -73,16 +73,16 @@ class GaussianRelease(ReleaseModel):
             math.hypot(*self.mu), task.settings.delta, self.sensitivity[0].contributions
         )
         shortest = min(task.corridor.segment_lengths)
-        sigma = np.tile(self.noise_std[task.group], (n, 1, 1))
+        sigma = np.tile(self.noise_std[task.channels.group], (n, 1, 1))
         if task.releases_flow:
-            self.unit, self.added_std = task.length, sigma * shortest
+            self.unit, self.added_std = task.channels.length, sigma * shortest
         else:
-            self.unit, self.added_std = task.length / shortest, sigma
+            self.unit, self.added_std = task.channels.length / shortest, sigma
         self._released_sigma = self.added_std / self.unit[:, None]
         v_0 = math.nan if task.flow_centre is None else task.flow_centre
-        self._centre = np.full((n, task.n_places), v_0)
-        self._price = np.ones((n, task.n_columns))
-        self.noise = Noise(n, task.n_columns, task.settings.noise)
+        self._centre = np.full((n, task.n_cells), v_0)
+        self._price = np.ones((n, task.n_channels))
+        self.noise = Noise(n, task.n_channels, task.settings.noise)
         self.ledgers = self._ledgers()
         if task.releases_flow:
             require_exact_sums(self.added_std[0].min(axis=0), self.ledgers.clip)
@@ -90,7 +90,7 @@ class GaussianRelease(ReleaseModel):
     def _ledgers(self) -> Ledgers:
         """Return ledgers of the vehicles, by which they may count without end."""
         return Ledgers(
-            self.task.columns, self.task.n_episodes, np.full(len(self.task.groups), math.inf)
+            self.task.channels, self.task.n_episodes, np.full(len(self.task.groups), math.inf)
         )
 
     @abstractmethod
@@ -210,13 +210,13 @@ class Paper(GaussianRelease):
     def __init__(self, task: Task, traffic: Traffic) -> None:
         """See `GaussianRelease`."""
         super().__init__(task, traffic)
-        in_order = np.array_equal(task.first, np.arange(task.n_places))
-        self._places = slice(None) if in_order else task.first
-        self._zero = np.zeros((task.n_episodes, task.n_places))
+        in_order = np.array_equal(task.channels.first, np.arange(task.n_cells))
+        self._places = slice(None) if in_order else task.channels.first
+        self._zero = np.zeros((task.n_episodes, task.n_cells))
 
     def _sensitivity(self, group: int) -> Sensitivity:
         task, corridor = self.task, self.task.corridor
-        always = int(np.count_nonzero(task.group[task.always] == group))
+        always = int(np.count_nonzero(task.channels.group[task.always] == group))
         return paper_sensitivity(
             n_sensors=(0 if group else task.queries.bandwidth) + always,
             average_dwell=corridor.average_dwell,
@@ -238,7 +238,7 @@ class Paper(GaussianRelease):
         task = self.task
         if not task.is_whole:
             return self._means(request)
-        values = self.traffic.aggregates(request.traffic, request.times, task.n_places)
+        values = self.traffic.aggregates(request.traffic, request.times, task.n_cells)
         return values[:, self._places] * self.unit[:, None]
 
     def _means(self, request: Request) -> FloatArray:
@@ -248,9 +248,9 @@ class Paper(GaussianRelease):
         """
         task = self.task
         sums = self.sums(request, self._zero)
-        counts = sums[..., 0].copy()
-        sums[..., 0] /= task.length
-        sums[..., 1] = np.where(counts == 0.0, task.limit, sums[..., 1] / np.maximum(counts, 1.0))
+        counts, limit = sums[..., 0].copy(), task.corridor.road.limits[task.channels.first]
+        sums[..., 0] /= task.channels.length
+        sums[..., 1] = np.where(counts == 0.0, limit, sums[..., 1] / np.maximum(counts, 1.0))
         sums *= self.unit[:, None]
         return sums
 
@@ -332,7 +332,7 @@ class Capped(GaussianRelease):
         budget = np.full(len(task.groups), math.inf if cap is None else float(cap))
         clip = self.flow_centre(task.corridor, task.settings)
         fastest = task.corridor.largest_speed_limit
-        return Ledgers(task.columns, task.n_episodes, budget, clip=clip, fastest=fastest)
+        return Ledgers(task.channels, task.n_episodes, budget, clip=clip, fastest=fastest)
 
     def _sensitivity(self, group: int) -> Sensitivity:
         corridor, settings = self.task.corridor, self.task.settings

@@ -101,7 +101,7 @@ class ReleaseModel(ABC):
             sigma: Shape (k, C, 2), or one that broadcasts to it.
         """
         centre = math.nan if self.task.flow_centre is None else self.task.flow_centre
-        places = np.full((len(values), self.task.n_places), centre)
+        places = np.full((len(values), self.task.n_cells), centre)
         return Measurement(request.observed, values, np.broadcast_to(sigma, values.shape), places)
 
     def spent(self, episodes: IntArray, steps: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -172,7 +172,7 @@ def check_released(release: ReleaseModel, released: Any, request: Request) -> No
     path = f"privacy.preset {name_of_class(release)}.release()"
     if not isinstance(released, Measurement):
         raise ValueError(f"{path} must return a Measurement, got {type(released).__name__}")
-    columns, places = request.observed.shape, (len(request.observed), release.task.n_places)
+    columns, places = request.observed.shape, (len(request.observed), release.task.n_cells)
     for name, array, kind, shape in (
         ("observed", released.observed, "b", columns),
         ("values", released.values, "f", (*columns, 2)),

@@ -124,7 +124,7 @@ class Paced(ReleaseModel):
         self._whole = self.mu**2
         self.budget = self._whole / self._squares
         self.ledgers = Ledgers(
-            task.columns,
+            task.channels,
             n,
             (1.0 - ROUNDING) * self.budget,
             ratio=settings.ratio,
@@ -134,23 +134,23 @@ class Paced(ReleaseModel):
         pacing = EventPacing if settings.unit == "event" else TripPacing
         # A pacing that offers the whole budget at once stays below what ledgers hold back.
         self.pacing: Pacing = pacing(task, (1.0 - 2.0 * ROUNDING) * self.budget)
-        self.noise = Noise(n, task.n_columns, settings.noise)
-        self.prices = np.zeros((n, task.n_columns))
+        self.noise = Noise(n, task.n_channels, settings.noise)
+        self.prices = np.zeros((n, task.n_channels))
         # The largest payments that a vehicle can have made in each group.
         self._charged = np.zeros((n, len(task.groups)))
         self._accounts = Bundle(
+            task.channels,
             _Accounts(
-                *task.columns, settings.ratio, settings.unit == "event", task.n_places,
-                self.prices, self._charged,
-            )
-        )  # fmt: skip
+                settings.ratio, settings.unit == "event", task.n_cells, self.prices, self._charged
+            ),
+        )
         self._flow_noise = settings.clip / math.sqrt(settings.ratio)
         require_covered(task.horizon * int(task.covers.sum(axis=0).max()))
         # No vehicle pays a price above its budget.
         least = 1.0 / math.sqrt(self.budget.max())
         require_exact_sums(np.array([least, self._flow_noise * least]), settings.clip)
         self._limits = np.array(task.corridor.speed_limits)
-        n_boundaries = task.n_places - task.corridor.n_segments
+        n_boundaries = task.n_cells - task.corridor.n_segments
         self._neighbours = np.array(task.corridor.boundary_neighbours)[:n_boundaries]
         self._fallback = np.zeros(n)
         self._refused = np.zeros((n, len(task.groups)), dtype=np.int64)
@@ -186,8 +186,8 @@ class Paced(ReleaseModel):
         sigma = np.empty((*prices.shape, 2))
         _charge(self._accounts, episodes, observed, prices, self._flow_noise, sigma)
         sums, self._refused[episodes] = self.collect(request, prices, centre, sigma)
-        values = self.noise.added(episodes, sums, sigma, task.length)
-        sigma /= task.length[:, None]
+        values = self.noise.added(episodes, sums, sigma, task.channels.length)
+        sigma /= task.channels.length[:, None]
         return Measurement(observed, values, sigma, centre)
 
     def _predicted(self, request: Request) -> tuple[FloatArray, FloatArray]:
@@ -197,7 +197,7 @@ class Paced(ReleaseModel):
         """
         prediction, task = request.prediction(), self.task
         predicted = np.empty((2, *prediction.density.shape))
-        centre = np.empty((predicted.shape[1], task.n_places))
+        centre = np.empty((predicted.shape[1], task.n_cells))
         fallback = np.empty(len(centre))
         _centre(
             prediction.density, prediction.speed, self._limits, self._neighbours,
@@ -295,14 +295,11 @@ class Paced(ReleaseModel):
 
 
 class _Accounts(NamedTuple):
-    """Columns of a release, and what is published of it."""
+    """What is published of a release."""
 
-    first: IntArray  # (C,) first place of each column
-    span: IntArray  # (C,) number of places that each covers
-    group: IntArray  # (C,) its group
     ratio: float
     is_event: bool
-    n_places: int
+    n_cells: int
     prices: FloatArray  # (n, C) of the last release
     charged: FloatArray  # (n, groups) the largest payments that a vehicle can have made
 
@@ -346,18 +343,18 @@ def _charge(
 
     Write the deviations of the noise of both sums to `sigma`, shape (k, C, 2).
     """
-    (accounts,) = bundle.parts
-    paid = np.empty((accounts.charged.shape[1], accounts.n_places))
+    channels, accounts = bundle.parts
+    paid = np.empty((accounts.charged.shape[1], accounts.n_cells))
     for k in range(episodes.size):
         paid[:] = 0.0
-        for c in range(accounts.first.size):
-            price, first = prices[k, c], accounts.first[c]
+        for c in range(channels.first.size):
+            price, first = prices[k, c], channels.first[c]
             accounts.prices[episodes[k], c] = price
             sigma[k, c, 0] = 1.0 / np.sqrt(price)
             sigma[k, c, 1] = flow_noise * sigma[k, c, 0]
             if observed[k, c]:
-                for s in range(first, first + accounts.span[c]):
-                    paid[accounts.group[c], s] += (1.0 + accounts.ratio) * price
+                for s in range(first, first + channels.span[c]):
+                    paid[channels.group[c], s] += (1.0 + accounts.ratio) * price
         charged = accounts.charged[episodes[k]]
         for g in range(charged.size):
             largest = paid[g].max()

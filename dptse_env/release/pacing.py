@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.model.network import Layout, make_layout
 from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.release.queries import QueryOptions
 from dptse_env.release.task import Task
+from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
 
@@ -33,63 +33,6 @@ MARGIN = 2.0
 
 MEMORY = 60.0
 """Time constant of the average by which rates of querying follow the queries [s]."""
-
-
-class PacedRoad(NamedTuple):
-    """A road, by its places: mainline, ramps, boundary segments."""
-
-    n_mainline: int  # n
-    n_segments: int  # S
-    length: FloatArray  # (S,) l of the segments [km]
-    edges: IntArray  # (E, 2) segments (from, to) between which vehicles pass
-    edge_share: FloatArray  # (E,) share of the outflow that passes
-    entries: IntArray  # (1 + I,) segments with inflow from outside: the first, then the on-ramps
-    entry_places: IntArray  # (1 + I,) boundary segments before them; negative if not released
-    exits: IntArray  # (1 + O,) segments with outflow: the last of the mainline, the off-ramps
-    exit_places: IntArray  # (1 + O,) boundary segments after them; negative if not released
-    next_segment: IntArray  # (S,) segment that each leads to, ahead on the mainline; -1 at exits
-
-    @classmethod
-    def make(cls, task: Task) -> PacedRoad:
-        """Return the road of a task."""
-        layout = make_layout(task.corridor)
-        S = layout.n_segments
-        released = task.n_places > S
-        before, after = layout.entry_boundaries, layout.exit_boundaries
-        return cls(
-            n_mainline=task.corridor.n_mainline,
-            n_segments=S,
-            length=layout.lengths,
-            edges=layout.edges,
-            edge_share=layout.edge_shares,
-            entries=layout.entries,
-            entry_places=S + before if released else np.full_like(before, -1),
-            exits=layout.exits,
-            exit_places=S + after if released else np.full_like(after, -1),
-            next_segment=_next_segments(layout),
-        )
-
-
-def _next_segments(layout: Layout) -> IntArray:
-    """Return the segment that each one leads to, (S,): the mainline at a diverge, -1 at an exit."""
-    following = np.full(layout.n_segments, -1, dtype=np.int64)
-    for start, end in layout.edges:
-        if following[start] < 0 or end < following[start]:
-            following[start] = end
-    return following
-
-
-class PacedColumns(NamedTuple):
-    """Columns of a release."""
-
-    first: IntArray  # (C,) first place of each
-    span: IntArray  # (C,) number of places that each covers
-    group: IntArray  # (C,) its group
-
-    @classmethod
-    def make(cls, task: Task) -> PacedColumns:
-        """Return the columns of a task."""
-        return cls(task.first, task.span, task.group)
 
 
 class Pacing(ABC):
@@ -136,6 +79,16 @@ class Pacing(ABC):
         return np.zeros((len(episodes), self.task.corridor.n_mainline))
 
 
+class Paces(NamedTuple):
+    """What a `TripPacing` offers, and its public state of n episodes."""
+
+    offered: FloatArray  # (groups,) part of each group's budget that a trip should spend
+    least: FloatArray  # (groups,) least that is offered for the rest of a trip
+    charge: float  # expected payment over the price
+    rates: FloatArray  # (n, groups, cells) of querying
+    tracer: FloatArray  # (n, groups, cells) expected payments so far
+
+
 class TripPacing(Pacing):
     """Prices for the unit ``trip``: they spend what is left of a budget evenly over its rest.
 
@@ -147,50 +100,50 @@ class TripPacing(Pacing):
     over its segments.
 
     Rates of querying are averages over the last minute or so. They begin at equal rates for all
-    segments, so that a policy that keeps querying the same place is soon paced for that.
+    segments, so that a policy that keeps querying the same cell is soon paced for that.
     """
 
     def __init__(self, task: Task, budget: FloatArray) -> None:
         """Prepare for episodes without any charge so far."""
         super().__init__(task, budget)
-        self._bundle = Bundle(PacedRoad.make(task), PacedColumns.make(task))
-        self._first_rates = np.zeros((len(task.groups), task.n_places))
-        self._first_rates[task.group[task.always], task.first[task.always]] = 1.0
+        self._first_rates = np.zeros((len(task.groups), task.n_cells))
+        self._first_rates[task.channels.group[task.always], task.channels.first[task.always]] = 1.0
         mainline = self._first_rates[0, : task.corridor.n_mainline]
         mainline[:] = np.maximum(mainline, _coverage(task.queries))
-        self._rates = np.tile(self._first_rates, (task.n_episodes, 1, 1))
-        self._tracer = np.zeros((task.n_episodes, *self._first_rates.shape))
-        self._offer = task.settings.pace * budget, LEAST_SHARE * budget
+        self._paces = Paces(
+            offered=task.settings.pace * budget,
+            least=LEAST_SHARE * budget,
+            charge=1.0 + MEAN_SQUARE * task.settings.ratio,
+            rates=np.tile(self._first_rates, (task.n_episodes, 1, 1)),
+            tracer=np.zeros((task.n_episodes, *self._first_rates.shape)),
+        )
+        self._bundle = Bundle(task.corridor.road, task.channels, self._paces)
 
     def reset(self, episodes: IntArray) -> None:
         """See `Pacing.reset`."""
-        self._rates[episodes] = self._first_rates
-        self._tracer[episodes] = 0.0
+        self._paces.rates[episodes] = self._first_rates
+        self._paces.tracer[episodes] = 0.0
 
     def prices(
         self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
     ) -> FloatArray:
         """See `Pacing.prices`."""
         prices = np.empty(observed.shape)
-        charge = 1.0 + MEAN_SQUARE * self.task.settings.ratio
-        _pace(
-            self._bundle, episodes, observed, density, speed, *self._offer, charge,
-            self._rates, self._tracer, prices,
-        )  # fmt: skip
+        _pace(self._bundle, episodes, observed, density, speed, prices)
         return prices
 
     def expected_prices(self, speed: FloatArray) -> FloatArray:
         """Return prices at the upstream end, at these speeds and the rates of the beginning."""
-        corridor = self.task.corridor
-        n, length = corridor.n_mainline, np.array(corridor.segment_lengths[: corridor.n_mainline])
+        road = self.task.corridor.road
+        n, length = road.n_mainline, road.lengths[: road.n_mainline]
         seconds = SECONDS_PER_HOUR * length / np.clip(speed[:n], SLOWEST, FASTEST)
         queried = (self._first_rates[:, :n] * seconds).sum(axis=1) + MARGIN
-        prices: FloatArray = self._offer[0] / queried
+        prices: FloatArray = self._paces.offered / queried
         return prices
 
     def tracer(self, episodes: IntArray) -> FloatArray:
         """See `Pacing.tracer`."""
-        tracer = self._tracer.take(episodes, 0)[:, 0, : self.task.corridor.n_mainline]
+        tracer = self._paces.tracer.take(episodes, 0)[:, 0, : self.task.corridor.n_mainline]
         part: FloatArray = np.minimum(tracer / self.budget[0], 1.0)
         return part
 
@@ -213,14 +166,14 @@ class EventPacing(Pacing):
         """Work out the price of a query that has a second's budget to itself."""
         super().__init__(task, budget)
         self._whole: FloatArray = budget / (1.0 + task.settings.ratio)
-        self._bundle = Bundle(PacedColumns.make(task))
+        self._bundle = Bundle(task.channels)
 
     def prices(
         self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
     ) -> FloatArray:
         """See `Pacing.prices`."""
         prices = np.empty(observed.shape)
-        _divide(self._bundle, self.task.n_places, observed, self._whole, prices)
+        _divide(self._bundle, self.task.n_cells, observed, self._whole, prices)
         return prices
 
     def expected_prices(self, speed: FloatArray) -> FloatArray:
@@ -235,31 +188,23 @@ def _pace(
     observed: BoolArray,
     density: FloatArray,
     speed: FloatArray,
-    offered: FloatArray,
-    least: FloatArray,
-    charge: float,
-    rates: FloatArray,
-    tracer: FloatArray,
     prices: FloatArray,
 ) -> None:
     """Move the tracers along, set prices, and charge the tracers for the queries.
 
     Args:
-        bundle: `PacedRoad` and `PacedColumns`.
+        bundle: `Road`, `Channels` and `Paces`, whose rates and tracers are updated.
         episodes: Shape (k,).
-        observed: Columns that are observed, shape (k, C).
+        observed: Channels that are observed, shape (k, C).
         density: Predicted densities [veh/km], shape (k, S).
         speed: Predicted speeds [km/h], shape (k, S).
-        offered: Part of each group's budget that a trip should spend, shape (groups,).
-        least: Least that is offered for the rest of a trip, shape (groups,).
-        charge: Expected payment over the price.
-        rates: Rates of querying, shape (n, groups, places), updated.
-        tracer: Expected payments so far, shape (n, groups, places), updated.
         prices: Output, shape (k, C).
     """
-    road, columns = bundle.parts
-    n_groups, places = tracer.shape[1], tracer.shape[2]
-    rest, before, charged = np.empty(places), np.empty(places), np.empty(places)
+    road, channels, paces = bundle.parts
+    offered, least, charge = paces.offered, paces.least, paces.charge
+    rates, tracer = paces.rates, paces.tracer
+    n_groups, n_cells = tracer.shape[1], tracer.shape[2]
+    rest, before, charged = np.empty(n_cells), np.empty(n_cells), np.empty(n_cells)
     inflow = np.empty((2, road.n_segments))
     for k in range(episodes.size):
         for g in range(n_groups):
@@ -268,19 +213,19 @@ def _pace(
             _carry(road, density[k], speed[k], before, paid, inflow)
             _remaining(road, speed[k], rate, rest)
             charged[:] = 0.0
-            for c in range(columns.first.size):
-                if columns.group[c] != g:
+            for c in range(channels.first.size):
+                if channels.group[c] != g:
                     continue
-                first, last = columns.first[c], columns.first[c] + columns.span[c]
+                first, last = channels.first[c], channels.first[c] + channels.span[c]
                 price = 0.0
                 for s in range(first, last):
                     price += max(offered[g] - paid[s], least[g]) / rest[s]
-                price /= columns.span[c]
+                price /= channels.span[c]
                 prices[k, c] = price
                 if observed[k, c]:
                     for s in range(first, last):
                         charged[s] += price
-            for s in range(places):
+            for s in range(n_cells):
                 paid[s] += charge * charged[s]
                 seen = 1.0 if charged[s] > 0.0 else 0.0
                 rate[s] += (seen - rate[s]) / MEMORY
@@ -288,7 +233,7 @@ def _pace(
 
 @kernel_part
 def _carry(
-    road: PacedRoad,
+    road: Road,
     density: FloatArray,
     speed: FloatArray,
     before: FloatArray,
@@ -304,22 +249,22 @@ def _carry(
         flow[end] += arriving
         mass[end] += arriving * before[start]
     for e in range(road.entries.size):
-        s, place = road.entries[e], road.entry_places[e]
+        s, cell = road.entries[e], road.entry_cells[e]
         arriving = density[s] * speed[s]
         flow[s] += arriving
-        if place >= 0:
-            mass[s] += arriving * before[place]
-            after[place] *= 1.0 - _moved(road.length[s], speed[s])
+        if cell < before.size:
+            mass[s] += arriving * before[cell]
+            after[cell] *= 1.0 - _moved(road.lengths[s], speed[s])
     for s in range(road.n_segments):
         if flow[s] > 0.0:
-            arrived = flow[s] / (SECONDS_PER_HOUR * road.length[s] * max(density[s], 1e-9))
+            arrived = flow[s] / (SECONDS_PER_HOUR * road.lengths[s] * max(density[s], 1e-9))
             share = min(arrived, 1.0)
             after[s] = (1.0 - share) * before[s] + share * mass[s] / flow[s]
     for e in range(road.exits.size):
-        s, place = road.exits[e], road.exit_places[e]
-        if place >= 0:
-            share = _moved(road.length[s], speed[s])
-            after[place] = (1.0 - share) * before[place] + share * before[s]
+        s, cell = road.exits[e], road.exit_cells[e]
+        if cell < before.size:
+            share = _moved(road.lengths[s], speed[s])
+            after[cell] = (1.0 - share) * before[cell] + share * before[s]
 
 
 @kernel_part
@@ -329,25 +274,26 @@ def _moved(length: float, speed: float) -> float:
 
 
 @kernel_part
-def _remaining(road: PacedRoad, speed: FloatArray, rate: FloatArray, rest: FloatArray) -> None:
-    """Write the queried seconds that a vehicle on each record column has still to come."""
+def _remaining(road: Road, speed: FloatArray, rate: FloatArray, rest: FloatArray) -> None:
+    """Write the queried seconds that a vehicle on each cell has still to come."""
     n, S = road.n_mainline, road.n_segments
     rest[:S] = 0.0
     for e in range(road.exits.size):
-        s, place = road.exits[e], road.exit_places[e]
+        s, cell = road.exits[e], road.exit_cells[e]
         rest[s] = MARGIN
-        if place >= 0:
-            rest[s] += _seconds(road.length[s], speed[s]) * rate[place]
-            rest[place] = rest[s]
+        if cell < rest.size:
+            rest[s] += _seconds(road.lengths[s], speed[s]) * rate[cell]
+            rest[cell] = rest[s]
     # Against the traffic: the segment that each one leads to comes first.
     for first, last in ((n, -1), (S, n - 1)):
         for s in range(first - 1, last, -1):
-            ahead = rest[road.next_segment[s]] if road.next_segment[s] >= 0 else rest[s]
-            rest[s] = ahead + _seconds(road.length[s], speed[s]) * rate[s]
+            following = road.parties[s, 1]
+            ahead = rest[following] if following >= 0 else rest[s]
+            rest[s] = ahead + _seconds(road.lengths[s], speed[s]) * rate[s]
     for e in range(road.entries.size):
-        s, place = road.entries[e], road.entry_places[e]
-        if place >= 0:
-            rest[place] = rest[s] + _seconds(road.length[s], speed[s]) * rate[place]
+        s, cell = road.entries[e], road.entry_cells[e]
+        if cell < rest.size:
+            rest[cell] = rest[s] + _seconds(road.lengths[s], speed[s]) * rate[cell]
 
 
 @kernel_part
@@ -358,20 +304,20 @@ def _seconds(length: float, speed: float) -> float:
 
 @kernel
 def _divide(
-    bundle: Bundle, n_places: int, observed: BoolArray, whole: FloatArray, prices: FloatArray
+    bundle: Bundle, n_cells: int, observed: BoolArray, whole: FloatArray, prices: FloatArray
 ) -> None:
-    """Divide a second's budgets alike among a group's queries that cover a place."""
-    (columns,) = bundle.parts
-    total = np.empty((whole.size, n_places))
+    """Divide a second's budgets alike among a group's queries that cover a cell."""
+    (channels,) = bundle.parts
+    total = np.empty((whole.size, n_cells))
     for k in range(observed.shape[0]):
         total[:] = 0.0
-        for c in range(columns.first.size):
+        for c in range(channels.first.size):
             if observed[k, c]:
-                for s in range(columns.first[c], columns.first[c] + columns.span[c]):
-                    total[columns.group[c], s] += 1.0
-        for c in range(columns.first.size):
-            most, g = 1.0, columns.group[c]
-            for s in range(columns.first[c], columns.first[c] + columns.span[c]):
+                for s in range(channels.first[c], channels.first[c] + channels.span[c]):
+                    total[channels.group[c], s] += 1.0
+        for c in range(channels.first.size):
+            most, g = 1.0, channels.group[c]
+            for s in range(channels.first[c], channels.first[c] + channels.span[c]):
                 own = 0.0 if observed[k, c] else 1.0
                 most = max(most, total[g, s] + own)
             prices[k, c] = whole[g] / most

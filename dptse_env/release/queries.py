@@ -9,8 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from dptse_env.model import MeasurementRows
-from dptse_env.model.network import covered
+from dptse_env.model import covered
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import BoolArray, IntArray
 
@@ -108,27 +107,18 @@ class QueryOptions:
         """Return the segments (k, n_mainline) that queried options (k, G) cover."""
         return queried.copy() if self.are_segments else queried @ self.covers
 
-    def rows(self, corridor: Corridor) -> MeasurementRows:
-        """Return the rows of a release: options, then ramps, then sensors without an option.
+    def sensor_channels(self, corridor: Corridor) -> tuple[int, ...]:
+        """Return the channel of each of the corridor's fixed sensors."""
+        others = {s: self.n_options + k for k, s in enumerate(self.others(corridor))}
+        channel = others if self.separate_sensors else self._singles | others
+        return tuple(channel[s] for s in corridor.fixed_sensors)
+
+    def others(self, corridor: Corridor) -> list[int]:
+        """Return the segments of the road's channels that are no options: ramps, then sensors.
 
         The last are mainline segments with a fixed sensor: those that are no option of span 1, or
         all where sensors are separate.
         """
-        others = np.array(self._others(corridor), dtype=np.int64)
-        return MeasurementRows(
-            np.concatenate([self.first, others]),
-            np.concatenate([self.span, np.ones_like(others)]),
-            corridor.n_segments,
-        )
-
-    def sensor_rows(self, corridor: Corridor) -> tuple[int, ...]:
-        """Return the row of each of the corridor's fixed sensors."""
-        others = {s: self.n_options + k for k, s in enumerate(self._others(corridor))}
-        row = others if self.separate_sensors else self._singles | others
-        return tuple(row[s] for s in corridor.fixed_sensors)
-
-    def _others(self, corridor: Corridor) -> list[int]:
-        """Return the segments of the rows that are no options."""
         n = self.n_mainline
         shared = {} if self.separate_sensors else self._singles
         sensors = [s for s in corridor.fixed_sensors if s < n and s not in shared]

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators import Estimate
-from dptse_env.model import MeasurementRows
-from dptse_env.model.network import covered
+from dptse_env.model import Channels
 from dptse_env.release.queries import QueryOptions
 from dptse_env.traffic import Corridor, Penetration
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -36,24 +35,23 @@ class Group(NamedTuple):
 class Task:
     """Measurements of a road in a batch of n episodes.
 
-    *Places* are the columns of a record: the S segments, then the R boundary segments where they
-    are released. *Columns* are those of a release: first the M rows of the road, which estimators
-    are given (the G options, the ramps, the fixed sensors that are no option), then the R boundary
-    segments. Each covers one place, or several that are neighbours; columns of a group are
-    neighbours, too.
+    *Cells* are the columns of a record: the S segments, then the R boundary cells where they are
+    released. *Channels* are what is measured: the M on the road, which estimators are given (the G
+    queries, the ramps, the fixed sensors that are no query), then the R boundary cells. Each covers
+    one cell, or several that are neighbours.
 
     Attributes:
         name: Name of the release model, for reports.
         settings: Its settings, of its ``settings_type``.
         corridor: The road, with the scales of densities and speeds.
-        queries: The options that can be queried, the first G columns, and their bandwidth.
+        queries: The queries that can be chosen, the first G channels, and their bandwidth.
         horizon: Steps of an episode.
         flow_centre: Speed v_0 [km/h] that released flows are centred on; None where mean speeds
             are released.
         has_prices: Whether queries have prices.
         n_episodes: Size n of the batch.
-        groups: Groups of columns, one or two. All columns are one group, or the options are the
-            first and all others the second.
+        groups: Groups of channels, one or two. All channels are one group, or the queries are
+            the first and all others the second.
     """
 
     name: str
@@ -68,7 +66,7 @@ class Task:
 
     @property
     def is_whole(self) -> bool:
-        """True if all columns see all vehicles, as one group."""
+        """True if all channels see all vehicles, as one group."""
         return len(self.groups) == 1 and self.groups[0].population is None
 
     @property
@@ -76,108 +74,74 @@ class Task:
         """True where flows are released, False where mean speeds are."""
         return self.flow_centre is not None
 
-    # Columns and places -------------------------------------------------------------------------
+    # Channels -----------------------------------------------------------------------------------
 
     @cached_property
-    def rows(self) -> MeasurementRows:
-        """The M rows."""
-        return self.queries.rows(self.corridor)
-
-    @property
-    def n_rows(self) -> int:
-        """Rows M that estimators are given."""
-        return self.rows.n_rows
-
-    @cached_property
-    def _boundary(self) -> IntArray:
-        """Places of the boundary segments, shape (R,)."""
-        is_private = self.settings.boundary == "private"
-        return self.corridor.n_segments + np.arange(self.corridor.n_boundaries * is_private)
-
-    @property
-    def n_places(self) -> int:
-        """Places S + R."""
-        return self.corridor.n_segments + self._boundary.size
-
-    @property
-    def n_columns(self) -> int:
-        """Columns C of a release."""
-        return self.first.size
-
-    @cached_property
-    def first(self) -> IntArray:
-        """The first place of each column, shape (C,)."""
-        return np.concatenate([self.rows.first, self._boundary])
-
-    @cached_property
-    def span(self) -> IntArray:
-        """Number of places that each column covers, shape (C,)."""
-        return np.concatenate([self.rows.span, np.ones_like(self._boundary)])
-
-    @cached_property
-    def length(self) -> FloatArray:
-        """Length of each column [km], shape (C,).
+    def channels(self) -> Channels:
+        """The C channels: queries, ramps, fixed sensors that are no query; then boundary cells.
 
         Sums over several segments are released where all lengths on the mainline are equal.
         """
-        corridor = self.corridor
-        every: FloatArray = np.array(corridor.with_boundaries(corridor.segment_lengths))
-        return every[self.first] * self.span
+        road, queries = self.corridor.road, self.queries
+        others = np.array(queries.others(self.corridor), dtype=np.int64)
+        boundary = np.arange(road.n_segments, self.n_cells)
+        first = np.concatenate([queries.first, others, boundary])
+        span = np.concatenate([queries.span, np.ones(others.size + boundary.size, dtype=np.int64)])
+        group = np.where(np.arange(first.size) < queries.n_options, 0, len(self.groups) - 1)
+        return Channels(first, span, group, road.lengths[first] * span)
+
+    @property
+    def n_channels(self) -> int:
+        """Channels C."""
+        return self.channels.size
 
     @cached_property
-    def limit(self) -> FloatArray:
-        """Speed limit at the first place of each column [km/h], shape (C,)."""
-        corridor = self.corridor
-        every: FloatArray = np.array(corridor.with_boundaries(corridor.speed_limits))
-        return every[self.first]
+    def n_cells(self) -> int:
+        """Cells that are measured: S + R where boundary cells are released, else S."""
+        road = self.corridor.road
+        return road.n_segments + (road.beside.size if self.settings.boundary == "private" else 0)
+
+    @property
+    def n_on_road(self) -> int:
+        """Channels M on the road, the first ones, which estimators are given."""
+        return self.n_channels - (self.n_cells - self.corridor.road.n_segments)
 
     @cached_property
     def sensors(self) -> IntArray:
-        """Column of each of the corridor's fixed sensors, shape (F,)."""
-        return np.array(self.queries.sensor_rows(self.corridor), dtype=np.int64)
+        """Channel of each of the corridor's fixed sensors, shape (F,)."""
+        return np.array(self.queries.sensor_channels(self.corridor), dtype=np.int64)
 
     @cached_property
     def always(self) -> IntArray:
-        """Columns that are observed at every step without a query, shape (A,)."""
-        return np.concatenate([self.sensors, np.arange(self.n_rows, self.n_columns)])
+        """Channels that are observed at every step without a query, shape (A,)."""
+        return np.concatenate([self.sensors, np.arange(self.n_on_road, self.n_channels)])
 
     def observed(self, queried: BoolArray) -> BoolArray:
-        """Return the observed columns (k, C) of queried options (k, G)."""
-        observed = np.zeros((len(queried), self.n_columns), dtype=bool)
+        """Return the observed channels (k, C) of queries (k, G)."""
+        observed = np.zeros((len(queried), self.n_channels), dtype=bool)
         observed[:, : queried.shape[1]] = queried
         observed[:, self.always] = True
         return observed
 
     def covered(self, observed: BoolArray) -> BoolArray:
-        """Return the mainline segments (k, n_mainline) of observed columns (k, C)."""
-        if self.rows.are_single:
+        """Return the mainline segments (k, n_mainline) of observed channels (k, C)."""
+        if self.queries.are_segments and self.n_on_road == self.corridor.road.n_segments:
             return observed[:, : self.corridor.n_mainline]
-        rows = observed[:, : self.n_rows].astype(np.float32)
-        segments: BoolArray = rows @ self._rows_cover > 0.0
+        on_road = observed[:, : self.n_on_road].astype(np.float32)
+        segments: BoolArray = on_road @ self._covers_mainline > 0.0
         return segments
-
-    @property
-    def columns(self) -> tuple[IntArray, IntArray, IntArray]:
-        """First place, number of places and group of each column, shape (C,) each."""
-        return self.first, self.span, self.group
 
     @cached_property
     def covers(self) -> BoolArray:
-        """True where a column covers a place, shape (C, S + R)."""
-        return covered(self.first, self.span, self.n_places)
+        """True where a channel covers a cell, shape (C, cells)."""
+        return self.channels.covers(self.n_cells)
 
     @cached_property
-    def _rows_cover(self) -> NDArray[np.float32]:
-        """Mainline segments in each row, shape (M, n_mainline): products of floats are faster."""
-        return self.covers[: self.n_rows, : self.corridor.n_mainline].astype(np.float32)
+    def _covers_mainline(self) -> NDArray[np.float32]:
+        """Shape (M, n_mainline), as numbers: products of floats are faster."""
+        return self.covers[: self.n_on_road, : self.corridor.n_mainline].astype(np.float32)
 
     # Groups -------------------------------------------------------------------------------------
-
-    @cached_property
-    def group(self) -> IntArray:
-        """Group of each column, ascending, shape (C,)."""
-        is_option = np.arange(self.n_columns) < self.queries.n_options
-        return np.where(is_option, 0, len(self.groups) - 1)
 
     @cached_property
     def shares(self) -> FloatArray:
@@ -191,7 +155,7 @@ class Task:
         return f"a connected vehicle: {what}, under queries and fixed sensors together"
 
     def group_reports(self, mu: FloatArray, noise_std: FloatArray) -> dict[str, Any]:
-        """Return ``groups`` for the details of a report; nothing where all columns are one group.
+        """Return ``groups`` for the details of a report; nothing where all channels are one group.
 
         Args:
             mu: Parameter of each group, shape (groups,).
@@ -222,10 +186,10 @@ class Request(NamedTuple):
     """A second of k episodes whose data is to be released.
 
     Attributes:
-        episodes: Distinct rows of the batch, shape (k,).
+        episodes: Distinct episodes of the batch, shape (k,).
         traffic: Index of each episode's traffic seed, shape (k,).
         times: Second of the record, shape (k,).
-        observed: Columns that were queried or are always observed, shape (k, C).
+        observed: Channels that were queried or are always observed, shape (k, C).
         prediction: Returns the estimator's prediction for this second, which is public: it depends
             on earlier releases and the configuration alone. Raises where there is no estimator.
     """

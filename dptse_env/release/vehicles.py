@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
+from dptse_env.model import Channels
 from dptse_env.release.noise import grid_of
 from dptse_env.traffic import MOST_VEHICLES, Corridor, Penetration, Record, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -83,8 +84,6 @@ class Traffic:
         # np.empty takes address space, not memory, until a record is written.
         self._table = np.empty((len(seeds), corridor.duration + 1, columns, 2))
         self._loaded = np.zeros(len(seeds), dtype=bool)
-        self._lengths = np.array(corridor.with_boundaries(corridor.segment_lengths))
-        self._limits = np.array(corridor.with_boundaries(corridor.speed_limits))
         self.n_vehicles: IntArray = np.zeros(len(seeds), dtype=np.int64)
         self._start: IntArray = np.zeros((len(seeds), corridor.duration + 2), dtype=np.int64)
         self._vehicle: NDArray[np.int32] = np.empty(0, dtype=np.int32)
@@ -104,8 +103,8 @@ class Traffic:
         if len(new) > 1:
             self.library.ensure(self.corridor, [self.seeds[index] for index in new])
         for index in new:
-            record = self.record(index)
-            self._table[index] = record.traffic(self._lengths, self._limits)
+            record, road = self.record(index), self.corridor.road
+            self._table[index] = record.traffic(road.lengths, road.limits)
             if self.populations:
                 self._append(index, record)
             self._loaded[index] = True
@@ -182,7 +181,7 @@ class Ledgers:
 
     def __init__(
         self,
-        columns: tuple[IntArray, IntArray, IntArray],
+        channels: Channels,
         n_episodes: int,
         budget: FloatArray,
         *,
@@ -193,7 +192,7 @@ class Ledgers:
         """Prepare for episodes; by default no contribution is clipped or costs by its speed.
 
         Args:
-            columns: First place, number of places and group of each column, shape (C,) each.
+            channels: What is measured.
             n_episodes: Episodes n.
             budget: See the attributes, as for the others.
             ratio: At most 1 where vehicles are replaced: two may deviate in opposite directions.
@@ -203,7 +202,7 @@ class Ledgers:
         self.budget, self.ratio, self.clip = budget, ratio, clip
         self.fastest = np.float32(fastest)
         self.paid: FloatArray = np.zeros((n_episodes, budget.size, 0))
-        self._columns = columns
+        self._channels = channels
 
     def reset(self, episodes: IntArray, n_vehicles: IntArray | None = None) -> None:
         """Clear the ledgers of episodes (k,), with room for the vehicles of every record."""
@@ -241,7 +240,7 @@ class Ledgers:
         sums = np.empty((*observed.shape, 2))
         refused = np.zeros((len(sums), self.budget.size), dtype=np.int64)
         _collect(
-            *self._columns, rows.start, rows.stop, rows.vehicle, rows.place, rows.speed,
+            *self._channels[:3], rows.start, rows.stop, rows.vehicle, rows.place, rows.speed,
             episodes, observed, prices, centre, sigma, self.fastest, self.clip, self.ratio,
             self.budget, self.paid, sums, refused,
         )  # fmt: skip

@@ -209,7 +209,7 @@ class Schedule(ABC):
             step: Decisions completed so far, shape (k,).
         """
         task = self.interface.observations.task
-        fixed = task.first[task.sensors]
+        fixed = task.channels.first[task.sensors]
         fixed = fixed[fixed < self.n_mainline]
         score = np.array(value, dtype=np.float64)
         if self.queries.are_segments:

@@ -8,12 +8,20 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from dptse_env.estimators.linalg import mirror, padded, pair_update, propagate
-from dptse_env.model.network import RoadArrays
-from dptse_env.model.step import advance, make_scratch, measured, normalise, project, write_row
+from dptse_env.model.arrays import ARZ, Channels
+from dptse_env.model.step import (
+    advance,
+    floored_speed,
+    make_scratch,
+    normalise,
+    project,
+    write_channel,
+)
 from dptse_env.process import QueryProcess
+from dptse_env.road import Road
 from dptse_env.schedules import ProcessSchedule, require_plain
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.kernels import copy_matrix, copy_vector, kernel, kernel_part
+from dptse_env.utils.kernels import Bundle, copy_matrix, copy_vector, kernel, kernel_part
 
 
 class Design(NamedTuple):
@@ -85,10 +93,10 @@ class GreedyTrace(ProcessSchedule):
                 f"{process.config.estimator!r} has none"
             )
         self._estimator: Any = process.estimator
-        every = np.arange(process.model.n_segments)
-        road = process.model.road._replace(row_first=every, row_span=np.ones_like(every))
-        self._road, self._design = tuple(road), tuple(self._make_design())
-        n = 2 * every.size
+        road, arz, _ = process.model.dynamics
+        channels = Channels.of_segments(road)
+        self._bundle = Bundle(road, arz, channels, self._make_design())
+        n = 2 * road.n_segments
         self._before = np.zeros((process.n_episodes, n, padded(n)))
         self._after = self._before.copy()
         self._second = np.full(process.n_episodes, -1)
@@ -110,7 +118,7 @@ class GreedyTrace(ProcessSchedule):
             process_variance=np.tile(np.square(self.process_noise), model.n_segments),
             is_walk=config.estimator == "random_walk",
             is_box=settings.bounds == "box",
-            lengths=np.array(corridor.segment_lengths[:n]),
+            lengths=model.road.lengths[:n],
             scales=np.array([corridor.density_scale, corridor.speed_scale]),
             speed_unit=float(model.speed_scale),
             term_weights=np.array([term != "speed", term != "density"], dtype=np.float64),
@@ -125,7 +133,7 @@ class GreedyTrace(ProcessSchedule):
         means = np.ascontiguousarray(self._estimator.states[episodes, : self._before.shape[1]])
         queried = np.zeros((len(episodes), self.n_mainline), dtype=bool)
         covariances = self._before, self._after
-        choose(self._road, self._design, episodes, means, inputs, *covariances, queried)
+        choose(self._bundle, episodes, means, inputs, *covariances, queried)
         return queried
 
     def _begin(self, episodes: IntArray) -> None:
@@ -162,8 +170,7 @@ class Work(NamedTuple):
 
 @kernel
 def choose(
-    road_: tuple[Any, ...],
-    design_: tuple[Any, ...],
+    bundle: Bundle,
     episodes: IntArray,
     means: FloatArray,
     inputs: FloatArray,
@@ -174,8 +181,7 @@ def choose(
     """Choose segments in turn, for k episodes.
 
     Args:
-        road_: The `RoadArrays`, with a row for each segment.
-        design_: The `Design`.
+        bundle: Road, model and a channel for each segment; the `Design`.
         episodes: Shape (k,).
         means: Present states, shape (k, 2 S) [veh/km, veh/h].
         inputs: The model's inputs of the coming second, shape (k, n_u).
@@ -183,8 +189,8 @@ def choose(
         after: Output, those after the coming second.
         queried: Output, shape (k, n), all False.
     """
-    road, design = RoadArrays(*road_), Design(*design_)
-    s, width = road.jam.size, before.shape[2]
+    road, arz, channels, design = bundle.parts
+    s, width = road.n_segments, before.shape[2]
     scratch, square = make_scratch(road), np.empty((2, 2 * s, width))
     columns = np.empty((4, width))
     work = Work(
@@ -196,14 +202,14 @@ def choose(
         copy_matrix(before[episodes[k]], covariance)
         copy_vector(means[k], work.mean)
         if not design.is_walk:
-            advance(road, work.mean, inputs[k], work.mean, work.blocks, scratch)
-            project(road, work.mean, design.is_box)
-        _linearise(road, design, work)
+            advance(road, arz, work.mean, inputs[k], work.mean, work.blocks, scratch)
+            project(road, arz, work.mean, design.is_box)
+        _linearise(road, arz, channels, design, work)
         if design.is_walk:
             _drift(design, covariance, work.to_speed)
         else:
             no_factors = np.empty((0, 2))
-            normalise(road, design.units[0], work.blocks, no_factors)
+            normalise(arz, design.units[0], work.blocks, no_factors)
             noise = design.process_variance
             propagate(road, work.blocks, no_factors, noise, covariance, work.square, covariance)
             mirror(covariance)
@@ -218,13 +224,15 @@ def choose(
 
 
 @kernel_part
-def _linearise(road: RoadArrays, design: Design, work: Work) -> None:
+def _linearise(road: Road, arz: ARZ, channels: Channels, design: Design, work: Work) -> None:
     """Linearise what is released, and speeds, at the predicted mean."""
     mean, v_f = work.mean, design.speed_unit
-    for s in range(road.jam.size):
-        write_row(road, design.units, mean, design.centre, s, work.rows[s], work.constants)
+    for s in range(road.n_segments):
+        write_channel(
+            arz, channels, design.units, mean, design.centre, s, work.rows[s], work.constants
+        )
         rho, psi = mean[2 * s], mean[2 * s + 1]
-        _, by_rho, by_psi = measured(rho, psi, road.jam[s], road.free_flow_speed, road.gamma)
+        _, by_rho, by_psi = floored_speed(rho, psi, arz.jam[s], arz.free_flow_speed, arz.gamma)
         work.to_speed[s, 0] = by_rho * design.units[2 * s] / v_f
         work.to_speed[s, 1] = by_psi * design.units[2 * s + 1] / v_f
 

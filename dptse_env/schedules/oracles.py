@@ -76,7 +76,7 @@ class OracleGain(ProcessSchedule):
         ahead, n = self.process.fork(), self.n_mainline
         traffic, times = ahead.traffic_index[episodes], ahead.time[episodes]
         ahead.estimator.predict(episodes, ahead.boundary.inputs(episodes, traffic, times))
-        every_column = np.ones((len(episodes), ahead.release.task.n_columns), dtype=bool)
+        every_column = np.ones((len(episodes), ahead.release.task.n_channels), dtype=bool)
         ahead.release.give_noise(np.zeros((ahead.n_episodes, every_column.shape[1], 2)))
         prediction = ahead.estimator.estimate().at(episodes)
         request = Request(episodes, traffic, times + 1, every_column, lambda: prediction)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, Self, TypeVar
 
+from dptse_env.road import Road, make_road
 from dptse_env.traffic.demand import (
     Demand,
     DemandDistribution,
@@ -265,6 +266,11 @@ class Corridor:
             ratio = road.largest_speed_limit / self.largest_speed_limit
             scales["speed_scale"] = self.speed_scale * ratio
         return dataclasses.replace(road, **{k: v for k, v in scales.items() if k not in fields})
+
+    @cached_property
+    def road(self) -> Road:
+        """The geometry as arrays."""
+        return make_road(self)
 
     @property
     def n_on_ramps(self) -> int:

@@ -21,9 +21,10 @@ from dptse_env.estimators import (
 from dptse_env.estimators.base import Estimator
 from dptse_env.estimators.recurrent import FORMAT, write_network
 from dptse_env.estimators.recurrent_kernels import CHANNELS, Network, shapes
-from dptse_env.model import ARZModel, MeasurementRows, load_parameters
+from dptse_env.model import ARZModel, Channels, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY, Corridor, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from tests.helpers import make_channels
 
 EVERY = [(name, "compiled") for name in ESTIMATORS] + [(name, "reference") for name in REFERENCES]
 RELEASES = ("speed", "flow", "rows")
@@ -63,18 +64,20 @@ class Episodes:
 def model_of(parameters: str, release: str, road: Corridor = PAPER_HIGHWAY) -> ARZModel:
     """A road as its sensors release it."""
     speed = None if release == "speed" else REFERENCE_SPEED
-    rows = None
+    channels = None
     if release == "rows":
-        rows = every_row(len(road.segment_lengths), road.n_mainline)
-    return ARZModel(road, load_parameters(parameters), reference_speed=speed, rows=rows)
+        channels = every_channel(len(road.segment_lengths), road.n_mainline)
+    return ARZModel(
+        road.road, load_parameters(parameters), reference_speed=speed, channels=channels
+    )
 
 
-def every_row(n_segments: int, n_mainline: int) -> MeasurementRows:
+def every_channel(n_segments: int, n_mainline: int) -> Channels:
     """All segments singly, then all pairs and triples of the mainline, which overlap."""
     pairs = [(first, 1) for first in range(n_segments)]
     pairs += [(first, span) for span in (2, 3) for first in range(n_mainline + 1 - span)]
     first, span = np.array(pairs, dtype=np.int64).T
-    return MeasurementRows(first.copy(), span.copy(), n_segments)
+    return make_channels(first, span)
 
 
 def simulate(
@@ -106,7 +109,7 @@ def simulate(
         swerve = 1.0 + 0.01 * rng.normal(size=state.shape)
         truth[k] = state = model.project(state * swerve)
 
-    shape, centre = (n_steps, n, model.rows.n_rows), None
+    shape, centre = (n_steps, n, model.channels.size), None
     sigma = np.broadcast_to(SPEEDS if release == "speed" else FLOWS, (*shape, 2))
     if release == "rows":
         observed = rng.random(shape) < 0.3
@@ -115,7 +118,7 @@ def simulate(
         centre = rng.uniform(20.0, 90.0, (n_steps, n, s))
     else:
         observed = rng.random(shape).argsort(axis=-1) < 5
-        observed[..., model.layout.exits] = True
+        observed[..., model.road.exits] = True
     start = model.states(np.full((n, s), 0.1) * jam, np.full((n, s), 0.5 * v_f))
     values = _measured(model, truth, centre) + noise * sigma * rng.normal(size=sigma.shape)
     return Episodes(model, start, inputs, truth, observed, values, sigma, centre)
@@ -143,18 +146,20 @@ def recorded(release: str) -> Episodes:
     values += sigma * np.random.default_rng(0).normal(size=traffic.shape)
     observed = np.zeros((len(traffic), s), bool)
     for k, row in enumerate(observed):
-        row[[*((3 * np.arange(5) + k) % 15), *model.layout.exits]] = True
+        row[[*((3 * np.arange(5) + k) % 15), *model.road.exits]] = True
     start = model.states(0.05 * model.jam_density[None], np.full((1, s), 0.64 * v_f))
     truth = model.states(traffic[..., 0], traffic[..., 1])
     each = (array[:, None] for array in (inputs, truth, observed, values))
     return Episodes(model, start, *each, np.broadcast_to(sigma, values[:, None].shape))
 
 
-def with_rows(episodes: Episodes, rows: MeasurementRows, places: IntArray) -> Episodes:
-    """The same episodes where more rows than are measured could be, those among them at places."""
+def with_channels(episodes: Episodes, channels: Channels, places: IntArray) -> Episodes:
+    """The same episodes where more could be measured, what is measured among it at some places."""
     old = episodes.model
-    model = ARZModel(old.network, old.parameters, reference_speed=old.reference_speed, rows=rows)
-    shape = (*episodes.observed.shape[:2], rows.n_rows)
+    model = ARZModel(
+        old.road, old.parameters, reference_speed=old.reference_speed, channels=channels
+    )
+    shape = (*episodes.observed.shape[:2], channels.size)
     observed, values, sigma = np.zeros(shape, bool), np.zeros((*shape, 2)), np.ones((*shape, 2))
     observed[..., places], values[..., places, :] = episodes.observed, episodes.values
     sigma[..., places, :] = episodes.sigma

@@ -20,7 +20,7 @@ from dptse_env.estimators.asm import (
 )
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
-from tests.helpers import UNEVEN, Road, compiled
+from tests.helpers import UNEVEN, Stretch, compiled
 from tests.model.oracle import PAPER
 
 from .helpers import Episodes, assert_same, run, show, simulate, started, step
@@ -34,11 +34,6 @@ def smoothing(**changes):
     return EstimatorSettings(asm=replace(AdaptiveSmoothingSettings(), **changes))
 
 
-def chains_of(network):
-    ramps = (*network.on_ramp_segments, *network.off_ramp_segments)
-    return [tuple(range(network.n_mainline)), *map(tuple, ramps)]
-
-
 class Textbook:
     """One episode, by sums over all values, as the module's docstring has them.
 
@@ -48,18 +43,19 @@ class Textbook:
 
     def __init__(self, model, start, settings):
         self.model, self.settings, self.t = model, settings.asm, 0
-        network, layout = model.network, model.layout
+        road = model.road
         self.chain, self.x = np.zeros((2, model.n_segments))
-        for i, chain in enumerate(chains_of(network)):
-            lengths = layout.lengths[list(chain)]
-            self.chain[list(chain)], self.x[list(chain)] = i, np.cumsum(lengths) - lengths / 2
+        for i in range(1 + road.stretch.max()):
+            chain = np.flatnonzero(road.stretch == i)
+            lengths = road.lengths[chain]
+            self.chain[chain], self.x[chain] = i, np.cumsum(lengths) - lengths / 2
         traffic = np.stack([model.density(start[None])[0], model.speed(start[None])[0]], -1)
         self.now = np.concatenate([traffic, np.zeros_like(traffic)], axis=1)
         unit = np.array([model.density_scale, model.speed_scale])
         variance = settings.initial_variance * unit**2
         self.values = [
             (self.chain[s], self.x[s], 0, 1.0, traffic[s] / [lanes, 1], variance / [lanes**2, 1])
-            for s, lanes in enumerate(layout.lanes)
+            for s, lanes in enumerate(road.lanes[: model.n_segments])
         ]
         self.evidence = np.full((model.n_segments, 2, 2), CONFIDENCE)
         self.smoothed = np.zeros((model.n_segments, 2))
@@ -71,7 +67,7 @@ class Textbook:
 
     def evaluate(self):
         model, constants = self.model, self.settings
-        lanes, lengths = model.layout.lanes, model.layout.lengths
+        lanes, lengths = model.road.lanes, model.road.lengths
         chain, x, t, weight = (np.array([v[i] for v in self.values]) for i in range(4))
         z, noise = (np.array([v[i] for v in self.values]) for i in (4, 5))
         for s in range(model.n_segments):
@@ -105,27 +101,23 @@ class Textbook:
             self.now[s] = density, speed, *np.sqrt(variances)
 
     def predict(self, inputs):
-        model, layout, weight = self.model, self.model.layout, self.settings.boundary_weight
+        model, road, weight = self.model, self.model.road, self.settings.boundary_weight
         self.t += 1
         v_f, gamma = model.parameters.free_flow_speed, model.parameters.gamma
         ends = []
-        for s, column, jam, lanes in zip(
-            layout.entries, layout.entry_inputs, model.entry_jam_density, layout.entry_lanes,
-            strict=True,
-        ):  # fmt: skip
+        for s, column, cell in zip(road.entries, road.entry_inputs, road.entry_cells, strict=True):
+            jam, lanes = model.arz.jam[cell], road.lanes[cell]
             demand, w = inputs[column : column + 2]
             rho = np.linspace(0.0, jam * (w / v_f / (1.0 + gamma)) ** (1.0 / gamma), 100_001)
             rho = np.interp(demand, rho * (w - v_f * (rho / jam) ** gamma), rho)
             v = w - v_f * (rho / jam) ** gamma
-            ends.append((s, self.x[s] - layout.lengths[s], rho / lanes, v))
-        for s, column, jam, lanes in zip(
-            layout.exits, layout.exit_inputs, model.exit_jam_density, layout.exit_lanes,
-            strict=True,
-        ):  # fmt: skip
+            ends.append((s, self.x[s] - road.lengths[s], rho / lanes, v))
+        for s, column, cell in zip(road.exits, road.exit_inputs, road.exit_cells, strict=True):
+            jam, lanes = model.arz.jam[cell], road.lanes[cell]
             rho, (own, speed) = inputs[column], self.now[s, :2]
             w = speed + v_f * (own / model.jam_density[s]) ** gamma
             v = max(w - v_f * (rho / jam) ** gamma, 0.0)
-            ends.append((s, self.x[s] + layout.lengths[s], rho / lanes, v))
+            ends.append((s, self.x[s] + road.lengths[s], rho / lanes, v))
         for s, x, rho, v in ends:
             self.values.append((self.chain[s], x, self.t, weight, np.array([rho, v]), np.zeros(2)))
         self.evidence = CONFIDENCE + np.exp(-model.time_step / MEMORY) * (
@@ -136,19 +128,20 @@ class Textbook:
     def update(self, observed, values, sigma, centre):
         """Return innovations."""
         model, innovations = self.model, np.zeros(values.shape)
-        lanes, flows = model.layout.lanes, model.reference_speed is not None
+        S = model.n_segments
+        lanes, flows = model.road.lanes[:S], model.reference_speed is not None
         density, speed, density_std, speed_std = self.now.T
         floored = np.maximum(density, LEAST_DENSITY * lanes)
         evidence = self.evidence.copy()
         for m in np.flatnonzero(observed):
-            H = model.rows.weights[m]
+            H = model.averaging[m]
             covered = np.flatnonzero(H)
             slip = speed - centre if flows else np.zeros(len(speed))
             by_speed = floored if flows else np.ones(len(speed))
             y = H @ (density * slip) if flows else H @ speed
             v = values[m, 1]
             if flows:
-                added = (floored - density) * model.network.speed_limits
+                added = (floored - density) * model.road.limits[:S]
                 v = (v + H @ (density * centre + added)) / (H @ floored)
             z = np.array([values[m, 0] / (H @ lanes), v])
             noise = np.array([sigma[m, 0] / (H @ lanes), sigma[m, 1] / (H @ by_speed)]) ** 2
@@ -208,7 +201,7 @@ def test_it_is_the_sum_over_all_values_that_its_equations_say(release, road):
 
 def on_a_road(n_steps, observed, values, parameters=PAPER, **fields):
     """An episode of values (T or 1, S, 2) whose inputs say of the ends what is measured first."""
-    model = ARZModel(Road(**fields), parameters)
+    model = ARZModel(Stretch(**fields).road, parameters)
     S = model.n_segments
     density, speed = (np.full((1, model.n_boundaries), values[0, 0, i]) for i in range(2))
     start = model.states(np.full((1, S), values[0, 0, 0]), np.full((1, S), values[0, 0, 1]))
@@ -267,8 +260,8 @@ def test_a_mean_stays_when_nothing_follows_for_long():
 def test_the_density_of_an_entry_is_read_off_the_inputs(parameters):
     """Up to the critical one: of a congested entry the inputs say no more."""
     parameters = load_parameters(parameters)
-    model = ARZModel(Road(n_mainline=3), parameters)
-    v_f, gamma, jam = parameters.free_flow_speed, parameters.gamma, model.entry_jam_density[0]
+    model = ARZModel(Stretch(n_mainline=3).road, parameters)
+    v_f, gamma, jam = parameters.free_flow_speed, parameters.gamma, model.arz.jam[3]
     density = np.linspace(0.0, 0.9 * jam, 60)
     speed = 0.9 * v_f * np.maximum(1.0 - (density / jam) ** gamma, 0.0)
     w = speed + v_f * (density / jam) ** gamma

@@ -172,7 +172,7 @@ def textbook(model, name, x, inputs, values, sigma, centre, rows):
     R = np.square(sigma / unit)
     for i, (first, span) in enumerate(rows):
         density = (mean * scale)[0 : 2 * S : 2][first : first + span].mean()
-        R[i, 0] += COUNT_NOISE * density / model.network.segment_length / span / rho_m**2
+        R[i, 0] += COUNT_NOISE * density / model.road.lengths[0] / span / rho_m**2
     spread = H @ known @ H.T + np.diag(R.ravel())
     residual = (values / unit).ravel() - look(mean * scale)
     gain = known @ H.T @ np.linalg.inv(spread)
@@ -197,13 +197,13 @@ def test_an_update_is_that_of_a_kalman_filter(name, backend, seen):
     model, rng = estimator.model, np.random.default_rng(2)
     inputs, centre = episodes.inputs[0], episodes.centre[0]
     x = np.concatenate([episodes.start[0], np.ones(3)])
-    ids = list(zip(model.rows.first.tolist(), model.rows.span.tolist(), strict=True))
+    ids = list(zip(model.channels.first.tolist(), model.channels.span.tolist(), strict=True))
     places = [ids.index(row) for row in seen]
     scale = SMALL * model.measurement_scale
-    sigma = scale * rng.uniform(0.5, 2.0, (1, model.rows.n_rows, 2))
+    sigma = scale * rng.uniform(0.5, 2.0, (1, model.channels.size, 2))
     after = model.step(x[None], inputs)
     values = model.measure(after, centre) + sigma * rng.normal(size=sigma.shape)
-    observed = np.zeros((1, model.rows.n_rows), bool)
+    observed = np.zeros((1, model.channels.size), bool)
     observed[:, places] = True
 
     step(estimator, episodes, 0, observed=observed, values=values, sigma=sigma)

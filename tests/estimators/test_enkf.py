@@ -9,10 +9,10 @@ from dptse_env.estimators import (
     EnsembleSettings,
     EstimatorSettings,
 )
-from dptse_env.estimators.enkf import gaspari_cohn, make_tapers, positions
-from dptse_env.model import ARZModel, MeasurementRows
+from dptse_env.estimators.enkf import gaspari_cohn, make_tapers
+from dptse_env.model import ARZModel
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
-from tests.helpers import pairwise
+from tests.helpers import make_channels, pairwise
 from tests.model.oracle import W99
 
 from .helpers import RELEASES, RICH, run, simulate, started, step, update
@@ -82,11 +82,11 @@ def test_inflation_alone_scales_distances_from_the_mean():
 def test_a_tapered_row_acts_near_any_of_its_segments_and_on_the_factor_of_a_near_entry():
     episodes = simulate(n_steps=10, release="rows")
     settings = EstimatorSettings(demand=DemandSettings(), enkf=EnsembleSettings(taper=0.25))
-    filters, rows = started("enkf", "compiled", episodes, settings), episodes.model.rows
+    filters, channels = started("enkf", "compiled", episodes, settings), episodes.model.channels
     run(filters, episodes, range(9))
     filters.predict(episodes.everyone, episodes.inputs[9])
     before = filters.members
-    update(filters, episodes, 9, observed=((rows.first == 1) & (rows.span == 3))[None])
+    update(filters, episodes, 9, observed=((channels.first == 1) & (channels.span == 3))[None])
     moved = np.abs(filters.members - before).max(axis=(0, 1)) > 1e-6
     near, factors = moved[:38].reshape(19, 2).any(axis=1), moved[38:]
     # Segments of 0.1 km, on-ramps at the faces 3 and 9 and off-ramps at 6 and 12.
@@ -99,7 +99,7 @@ def test_a_tapered_row_acts_near_any_of_its_segments_and_on_the_factor_of_a_near
 def test_a_taper_leaves_a_definite_s_where_a_few_members_do_not():
     """Known exactly, 22 outputs of 4 members have no definite S: flagged, not solved."""
     episodes = simulate(n_steps=1, release="rows")
-    only = (np.arange(episodes.model.rows.n_rows) % 4 == 0)[None]
+    only = (np.arange(episodes.model.channels.size) % 4 == 0)[None]
     for taper, diverges in ((None, True), (0.2, False)):
         enkf = EnsembleSettings(n_members=4, taper=taper)
         for backend in BACKENDS:
@@ -128,19 +128,21 @@ def test_gaspari_cohn_is_a_convolution_of_tents():
 
 
 @pytest.mark.parametrize("reach", [0.05, 0.3, 2.0])
-def test_weights_of_rows_and_states_are_averages_and_positive_semidefinite(reach):
+def test_weights_of_channels_and_states_are_averages_and_positive_semidefinite(reach):
     """Jointly with those among the components, at the segments and the factors' entries."""
     # On-ramp at face 2, off-ramp at face 4, segments of 0.1 km.
     places = [0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.2, 0.4]
-    np.testing.assert_allclose(positions(SHORT_HIGHWAY), places)
-    rows = MeasurementRows(np.array([0, 0, 1, 4, 8, 9, 12]), np.array([1, 2, 3, 5, 2, 3, 3]), 19)
-    model = ARZModel(PAPER_HIGHWAY, W99, 1.0, 51.0, rows, True)
-    x, weights = positions(PAPER_HIGHWAY), make_tapers(model, reach)
-    cells = np.concatenate([np.repeat(np.arange(19), 2), model.layout.entries])
+    np.testing.assert_allclose(SHORT_HIGHWAY.road.position, places)
+    channels = make_channels((0, 0, 1, 4, 8, 9, 12), (1, 2, 3, 5, 2, 3, 3))
+    model = ARZModel(PAPER_HIGHWAY.road, W99, 1.0, 51.0, channels, True)
+    x, weights = model.road.position, make_tapers(model, reach)
+    cells = np.concatenate([np.repeat(np.arange(19), 2), model.road.entries])
     among = gaspari_cohn(np.abs(x[:, None] - x), reach)
     states = among[np.ix_(cells, cells)]
     np.testing.assert_allclose(weights.with_states[2], states[2:8:2].mean(axis=0), atol=1e-14)
-    np.testing.assert_allclose(weights.among_rows[2, 3], among[1:4, 4:9].mean(), atol=1e-14)
-    joint = np.block([[states, weights.with_states.T], [weights.with_states, weights.among_rows]])
+    np.testing.assert_allclose(weights.among_channels[2, 3], among[1:4, 4:9].mean(), atol=1e-14)
+    joint = np.block(
+        [[states, weights.with_states.T], [weights.with_states, weights.among_channels]]
+    )
     np.testing.assert_allclose(joint, joint.T, atol=1e-15)
     assert np.linalg.eigvalsh(joint).min() > -1e-12

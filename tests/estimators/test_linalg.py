@@ -22,7 +22,7 @@ pair_update, products, propagate, scalar_update, solve, solve_many = (
     )
 )  # fmt: skip
 
-MODEL = ARZModel(PAPER_HIGHWAY, PAPER, demand_states=True)
+MODEL = ARZModel(PAPER_HIGHWAY.road, PAPER, demand_states=True)
 ROAD, N = MODEL.road, MODEL.n_states
 WIDTH = linalg.padded(N)
 

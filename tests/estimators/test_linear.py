@@ -16,7 +16,7 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel
-from tests.helpers import Road, pairwise
+from tests.helpers import Stretch, pairwise
 from tests.model.oracle import PAPER
 
 from .helpers import random_streams
@@ -42,7 +42,7 @@ class Sensor(NamedTuple):
 SENSORS = {
     # Below the density that a measurement takes at least, the speed is linear in psi.
     "speed": Sensor(
-        ARZModel(Road(n_mainline=1), PAPER),
+        ARZModel(Stretch(n_mainline=1).road, PAPER),
         np.array([[1.0, 0.0], [0.0, 1.0 / FLOOR]]),
         np.array([0.0, -V_F * 0.01**2]),
         np.array([0.4, 6.0]),
@@ -50,7 +50,9 @@ SENSORS = {
     # Long segments, for the CFL condition; a pressure of (2 / 333)^10 is none.
     "flow": Sensor(
         ARZModel(
-            Road(n_mainline=1, segment_length=1.0), replace(PAPER, gamma=10.0), reference_speed=V_0
+            Stretch(n_mainline=1, segment_length=1.0).road,
+            replace(PAPER, gamma=10.0),
+            reference_speed=V_0,
         ),
         np.array([[1.0, 0.0], [-V_0, 1.0]]),
         np.zeros(2),

@@ -22,7 +22,7 @@ def test_experts_are_weighed_by_what_they_foretell(release):
     model, settings, likelihoods = episodes.model, mixing(memory=20.0), np.zeros((3, 2))
     mixture = started("mixture", "compiled", episodes, settings)
     experts = [started(name, "compiled", episodes, settings) for name in EXPERTS]
-    H = model.rows.weights
+    H = model.averaging
     for k in range(25):
         step_of = episodes.inputs[k], episodes.observed[k]
         likelihoods *= 1.0 - 1.0 / 20.0

@@ -18,7 +18,7 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel
-from tests.helpers import Road, fast_and_slow
+from tests.helpers import Stretch, fast_and_slow
 from tests.model.oracle import PAPER
 
 from .helpers import (
@@ -27,7 +27,7 @@ from .helpers import (
     PLAIN,
     Snapshot,
     assert_same,
-    every_row,
+    every_channel,
     model_of,
     random_streams,
     recorded,
@@ -37,7 +37,7 @@ from .helpers import (
     started,
     step,
     update,
-    with_rows,
+    with_channels,
 )
 
 # Each compiled one is compared with its reference in a module of its own: the references, and the
@@ -85,7 +85,7 @@ def steps_of(name, backend, many):
 def test_every_name_and_backend_follows_the_protocol(name, backend):
     """And measures as its model does."""
     for reference_speed, second in ((None, 80.0), (40.0, 30.0 * (80.0 - 40.0))):
-        model = ARZModel(MODEL.network, PAPER, 0.5, reference_speed)
+        model = ARZModel(MODEL.road, PAPER, 0.5, reference_speed)
         estimator, everyone = make_estimator(name, backend, model, 3), np.arange(3)
         states = model.states(np.full((3, 19), 30.0), np.full((3, 19), 80.0))
         np.testing.assert_allclose(estimator.model.measure(states)[..., 1], second)
@@ -130,7 +130,7 @@ from dptse_env.estimators import make_estimator
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 for backend in ("compiled", "reference"):
-    make_estimator("ekf", backend, ARZModel(PAPER_HIGHWAY, load_parameters("paper")), 1)
+    make_estimator("ekf", backend, ARZModel(PAPER_HIGHWAY.road, load_parameters("paper")), 1)
     assert ("filterpy" in sys.modules) == (backend == "reference")
 """
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -154,18 +154,18 @@ def test_bad_measurements_are_named(changes, message):
         "sigma": np.ones(2),
         "centre": np.ones(5),
     }
-    model = ARZModel(Road(n_mainline=5), PAPER, reference_speed=50.0)
+    model = ARZModel(Stretch(n_mainline=5).road, PAPER, reference_speed=50.0)
     with pytest.raises(ValueError, match=message):
         Measurement.of(model, **{**good, **changes})
 
 
 def test_what_a_measurement_leaves_out_is_filled_in_and_boundary_columns_are_left_out():
     observed, values, sigma = np.ones((2, 5), bool), np.zeros((2, 5, 2)), np.array([3.0, 4.0])
-    flows = ARZModel(Road(n_mainline=5), PAPER, reference_speed=50.0)
+    flows = ARZModel(Stretch(n_mainline=5).road, PAPER, reference_speed=50.0)
     given = Measurement.of(flows, observed, values, sigma)
     np.testing.assert_array_equal(given.sigma, np.broadcast_to(sigma, (2, 5, 2)))
     np.testing.assert_array_equal(given.centre, np.full((2, 5), 50.0))
-    speeds = ARZModel(Road(n_mainline=5), PAPER)
+    speeds = ARZModel(Stretch(n_mainline=5).road, PAPER)
     given = Measurement.of(speeds, observed, values, sigma, np.full(5, 7.0))
     assert np.isnan(given.centre).all()  # speeds have no centre
     more = np.ones((2, 7), bool), np.ones((2, 7, 2)), np.ones((2, 7, 2)), np.ones((2, 6))
@@ -322,13 +322,13 @@ def test_the_noise_is_as_large_as_the_settings_say(name, backend, release):
 
 @over(fast=[("mhe", "compiled", "flow") if case[0] == "mhe" else case for case in FAST],
       cases=[case for case in CASES if case[2] == "flow"])  # fmt: skip
-def test_rows_that_nobody_measures_change_nothing(name, backend, release):
-    """Nor does the order of rows, but for the draws of the EnKF."""
+def test_channels_that_nobody_measures_change_nothing(name, backend, release):
+    """Nor does the order of channels, but for the draws of the EnKF."""
     plain = simulate(n_steps=12, release=release)
     order = np.random.default_rng(3).permutation(19) if name != "enkf" else np.arange(19)
-    rows = every_row(19, 15)
-    rows.first[order], rows.span[order] = rows.first[:19].copy(), 1
-    among = with_rows(plain, rows, order)
+    channels = every_channel(19, 15)
+    channels.first[order], channels.span[order] = channels.first[:19].copy(), 1
+    among = with_channels(plain, channels, order)
     a, b = started(name, backend, plain), started(name, backend, among)
     run(a, plain, range(12))
     run(b, among, range(12))
@@ -404,7 +404,7 @@ def test_a_cap_holds_the_reported_speeds_and_nothing_else(name, backend):
         started(name, backend, episodes, settings, mixed)
         for settings in (PLAIN, EstimatorSettings(speed_cap=0.7))
     )
-    largest = 0.7 * episodes.model.network.speed_limit
+    largest = 0.7 * episodes.model.road.limits[0]
     for k in range(4):
         for one in (plain, held):
             step(one, episodes, k)

@@ -54,7 +54,7 @@ def channels(model, measured, inputs, prior, age):
     """
     cells, flows = make_cells(model), float(model.reference_speed is not None)
     observed, values, sigma, centre = (part[0] for part in measured)
-    H = model.rows.weights[observed]  # of densities; a row averages over its cells
+    H = model.averaging[observed]  # of densities; a channel averages over its cells
     covers, values, sigma = H > 0.0, values[observed], sigma[observed]
     rho, v, P_rho, P_v = *prior.T[:2], *prior.T[2:] ** 2
     slip = v - centre if flows else np.zeros(len(v))
@@ -65,12 +65,13 @@ def channels(model, measured, inputs, prior, age):
     e_rho, e_y = values[:, 0] - H @ rho, values[:, 1] - H @ y
     innovations = np.zeros((len(observed), 2))
     innovations[observed] = np.stack([e_rho / np.sqrt(V_rho), e_y / np.sqrt(V_y)], axis=-1)
-    n, unit, limit = covers.sum(axis=0), cells.unit, cells.limit
+    n, unit, limit = covers.sum(axis=0), cells.unit[: model.n_segments], cells.limit
     queried = np.minimum(n, 1)
     log_sigma = np.log(np.clip(sigma, 0.1, 1e6)).T @ covers / np.maximum(n, 1)
     outside = np.zeros((2, len(v)))
-    outside[0, cells.entries] = inputs[cells.entry_inputs] / (2000.0 * cells.lanes[cells.entries])
-    outside[1, cells.exits] = inputs[cells.exit_inputs] / cells.exit_units
+    road = model.road
+    outside[0, road.entries] = inputs[road.entry_inputs] / (2000.0 * road.lanes[road.entries])
+    outside[1, road.exits] = inputs[road.exit_inputs] / cells.unit[road.exit_cells]
 
     def held(numbers, largest):
         return np.clip(numbers, -largest, largest)
@@ -98,13 +99,14 @@ class Twin:
     """The network that is trained, in double precision, on the episodes of an estimator."""
 
     def __init__(self, estimator):
-        self.model, cells, n = estimator.model, estimator.cells, estimator.n_episodes
+        self.model, n = estimator.model, estimator.n_episodes
+        cells = make_cells(self.model)
         self.network = trained.RecurrentNetwork(estimator.saved.network.width)
         self.network.take(estimator.saved.network)
         S = self.model.n_segments
-        edges = cells.edges + S * np.arange(n)[:, None, None]
+        edges = self.model.road.edges + S * np.arange(n)[:, None, None]
         self.roads = trained.Roads(
-            torch.from_numpy(np.tile(cells.unit, n)),
+            torch.from_numpy(np.tile(cells.unit[:S], n)),
             torch.full((n * S,), cells.limit),
             torch.from_numpy(edges.reshape(-1, 2)),
             torch.ones(n * S, 2),
@@ -182,7 +184,7 @@ def test_news_travel_from_cell_to_cell(tmp_path):
     pair = [of_network(episodes, tmp_path) for _ in range(2)]
     n = episodes.model.n_segments
     sparsity = np.eye(n, dtype=bool)
-    for start, end in episodes.model.layout.edges:
+    for start, end in episodes.model.road.edges:
         sparsity[start, end] = sparsity[end, start] = True
     observed = np.zeros_like(episodes.observed[0])
     reached = np.arange(n) == 8
@@ -201,9 +203,10 @@ def test_deviations_and_estimates_stay_in_their_range(tmp_path):
     network = network._replace(heads_bias=np.array([90, 90, -90, 90] * 2, dtype=np.float32))
     estimator = of_network(episodes, tmp_path, network)
     run(estimator, episodes, range(30))
-    estimate, unit = estimator.estimate(), estimator.cells.unit
+    model = episodes.model
+    estimate, unit = estimator.estimate(), make_cells(model).unit[: model.n_segments]
     np.testing.assert_allclose(estimate.density[0], 4.0 * unit)
-    np.testing.assert_allclose(estimate.speed, 1.1 * episodes.model.network.speed_limit)
+    np.testing.assert_allclose(estimate.speed, 1.1 * model.road.limits.max())
     np.testing.assert_allclose(estimate.density_std[0], unit * np.exp(LOWEST_SPREAD))
 
 
@@ -216,7 +219,7 @@ def test_what_a_network_was_not_trained_on_is_named(tmp_path):
         ({"lanes": [2, 3], "speed_limit": [80.0, 100.0]}, ["speed_limit", "lanes"]),
     ):
         write_network(path, random_network(), {**card(), "ranges": ranges})
-        assert set(outside(read_network(str(path)), road, False, 3)) == set(names)
+        assert set(outside(read_network(str(path)), road.road, False, 3)) == set(names)
 
 
 # Files of networks --------------------------------------------------------------------------------
@@ -282,7 +285,7 @@ def test_a_pair_is_found_by_the_name_it_shares(tmp_path):
     ],
 )
 def test_the_network_of_the_package_that_knows_a_road_is_taken(road, flows, network):
-    assert network_for(None, road, flows).source == network
+    assert network_for(None, road.road, flows).source == network
 
 
 def test_damaged_files_are_refused(path, tmp_path):

@@ -31,7 +31,7 @@ class TextbookWalk:
         innovations = np.zeros(values.shape)
         for m in np.flatnonzero(observed):
             for i in range(2):
-                H, value = self.model.rows.weights[m].copy(), values[m, i]
+                H, value = self.model.averaging[m].copy(), values[m, i]
                 if i == 1 and self.model.reference_speed is not None:
                     H *= np.maximum(self.means[:, 0], 0.01 * self.model.jam_density)
                     value += H @ centre

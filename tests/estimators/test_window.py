@@ -19,8 +19,8 @@ evaluate, write_diagonal = compiled(parts.evaluate), compiled(parts.write_diagon
 make_factor, minimise = compiled(parts.make_factor), compiled(parts.minimise)
 
 MODEL = with_demand(model_of("w99-3lane", "rows", UNEVEN), RICH)
-ROAD, N = MODEL.road, MODEL.n_states
-WIDTH, N_ROWS = padded(N), MODEL.rows.n_rows
+ROAD, CHANNELS, N = MODEL.road, MODEL.channels, MODEL.n_states
+WIDTH, N_CHANNELS = padded(N), MODEL.channels.size
 
 
 class Program(NamedTuple):
@@ -46,7 +46,7 @@ def random_program(n_stages=4, spread=1.0):
         spread: Deviation of what is measured from the middle of the bounds.
     """
     rng = np.random.default_rng(0)
-    s, k, n_factors = ROAD.jam.size, ROAD.neighbours.shape[1], N - 2 * ROAD.jam.size
+    s, k, n_factors = ROAD.n_segments, ROAD.neighbours.shape[1], N - 2 * ROAD.n_segments
     window = Window(
         arrival=rng.normal(0.5, spread, N),
         arrival_variance=rng.uniform(0.1, 1.0, N),
@@ -54,10 +54,10 @@ def random_program(n_stages=4, spread=1.0):
         by_factor=rng.normal(0.0, 0.5, (n_stages, n_factors, 2)),
         offsets=rng.normal(0.2, 0.1, (n_stages, N)),
         process_variance=rng.uniform(0.01, 0.1, (n_stages, N)),
-        observed=rng.random((n_stages, N_ROWS)) < 0.3,
-        weights=rng.normal(0.0, 1.0, (n_stages, N_ROWS, 2, 6)),
-        targets=rng.normal(0.5, spread, (n_stages, N_ROWS, 2)),
-        noise=0.01 * rng.uniform(0.5, 1.5, (n_stages, N_ROWS, 2)),
+        observed=rng.random((n_stages, N_CHANNELS)) < 0.3,
+        weights=rng.normal(0.0, 1.0, (n_stages, N_CHANNELS, 2, 6)),
+        targets=rng.normal(0.5, spread, (n_stages, N_CHANNELS, 2)),
+        noise=0.01 * rng.uniform(0.5, 1.5, (n_stages, N_CHANNELS, 2)),
         lower=np.zeros(N),
         upper=np.ones(N),
     )
@@ -66,12 +66,12 @@ def random_program(n_stages=4, spread=1.0):
 
 def transition(window, t):
     A = np.zeros((N, N))
-    for c in range(ROAD.jam.size):
+    for c in range(ROAD.n_segments):
         for slot in range(ROAD.degree[c]):
             b = ROAD.neighbours[c, slot]
             A[2 * c : 2 * c + 2, 2 * b : 2 * b + 2] += window.blocks[t, c, slot].reshape(2, 2)
     for e in range(window.by_factor.shape[1]):
-        factor = 2 * ROAD.jam.size + e
+        factor = 2 * ROAD.n_segments + e
         A[2 * ROAD.entries[e] : 2 * ROAD.entries[e] + 2, factor] = window.by_factor[t, e]
         A[factor, factor] = 1.0
     return A
@@ -93,8 +93,8 @@ def dense(window):
         add([t, t + 1], B, window.offsets[t], window.process_variance[t])
     for t in range(n_stages):
         for m in np.flatnonzero(window.observed[t]):
-            at, B = 2 * ROAD.row_first[m], np.zeros((2, N))
-            size = 2 * ROAD.row_span[m]
+            at, B = 2 * MODEL.channels.first[m], np.zeros((2, N))
+            size = 2 * MODEL.channels.span[m]
             B[:, at : at + size] = window.weights[t, m, :, :size]
             add([t], B, window.targets[t, m], window.noise[t, m])
     return H, q
@@ -103,10 +103,10 @@ def dense(window):
 def iterate_at(program, z):
     """An iterate with a trajectory `(L, n_x)`."""
     shape = program.n_stages, WIDTH
-    residuals = np.zeros((program.n_stages, 2 * N_ROWS))
+    residuals = np.zeros((program.n_stages, 2 * N_CHANNELS))
     iterate = Iterate(np.zeros(shape), np.zeros(shape), residuals, np.zeros(shape))
     iterate.z[:, :N] = z
-    evaluate(ROAD, program.window, iterate)
+    evaluate(ROAD, CHANNELS, program.window, iterate)
     return iterate
 
 
@@ -118,8 +118,8 @@ def random_set(program, n_active, seed=1):
 
 
 def factor_of(program, active_set):
-    factor = make_factor(program.n_stages, N, N_ROWS, program.window.weights.shape[3], WIDTH)
-    assert factorise(ROAD, program.window, active_set, factor)
+    factor = make_factor(program.n_stages, N, N_CHANNELS, program.window.weights.shape[3], WIDTH)
+    assert factorise(ROAD, CHANNELS, program.window, active_set, factor)
     return factor
 
 
@@ -135,7 +135,7 @@ def test_an_iterate_has_the_objectives_gradient():
     found, diagonal = iterate_at(program, z).negative_gradient[:, :N], np.ones((4, WIDTH))
     expected = -program.H @ z.ravel() - program.q / 2
     np.testing.assert_allclose(found.ravel(), expected, atol=1e-10)
-    write_diagonal(ROAD, program.window, diagonal)
+    write_diagonal(ROAD, CHANNELS, program.window, diagonal)
     np.testing.assert_allclose(diagonal[:, :N].ravel(), np.diag(program.H), rtol=1e-12)
 
 
@@ -166,7 +166,7 @@ def test_a_factor_is_renewed_from_the_first_stage_whose_set_differs():
     one, other = random_set(program, 30), random_set(program, 30, seed=4)
     other[:2] = one[:2]
     used = factor_of(program, one)
-    assert factorise(ROAD, program.window, other, used)
+    assert factorise(ROAD, CHANNELS, program.window, other, used)
     fresh, iterate = factor_of(program, other), iterate_at(program, z)
     steps = [step_from(program, factor, iterate, False) for factor in (used, fresh)]
     np.testing.assert_array_equal(*steps)
@@ -184,7 +184,7 @@ def test_a_minimum_within_bounds_is_that_of_a_general_solver(spread, n_stages, h
     z, active_set = np.zeros((n_stages, WIDTH)), np.zeros((n_stages, WIDTH), np.int64)
     z[:, :N] = 0.5 if guess == "middle" else 0.0
     active_set[:, :N] = 0 if guess == "middle" else np.where(np.arange(N) % 7 == 0, -1, 0)
-    found = minimise(ROAD, program.window, factor, active_set, z)
+    found = minimise(ROAD, CHANNELS, program.window, factor, active_set, z)
     lower, upper = program.bounds()
     x = z[:, :N].ravel()
     assert found == how if guess == "middle" else found in (ACTIVE_SET, NEWTON)

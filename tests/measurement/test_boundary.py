@@ -48,8 +48,8 @@ def take(boundary, density, speed, centre=None):
     model = boundary.model
     if centre is not None:
         speed = density * (speed - centre)
-    values = np.zeros((1, model.rows.n_rows + R, 2))
-    values[:, model.rows.n_rows :, 0], values[:, model.rows.n_rows :, 1] = density, speed
+    values = np.zeros((1, model.channels.size + R, 2))
+    values[:, model.channels.size :, 0], values[:, model.channels.size :, 1] = density, speed
     places = np.full((1, model.n_segments + R), np.nan if centre is None else CENTRE)
     places[:, model.n_segments :] = np.nan if centre is None else centre
     observed = np.ones(values.shape[:2], dtype=bool)
@@ -108,7 +108,7 @@ def test_a_release_is_read_within_what_a_road_can_hold(density, speed, read_dens
 @pytest.mark.parametrize(("preset", "centre"), [("corrected", None), ("capped", CENTRE)])
 def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(preset, centre):
     boundary, model = make("private", preset)
-    layout, v_f = model.layout, model.parameters.free_flow_speed
+    road, jam, v_f = model.road, model.arz.jam, model.parameters.free_flow_speed
     state = model.project(np.full((1, model.n_states), 30.0))
     size = st.floats(-1e7, 1e7) | st.sampled_from([0.0, -1e-300, 1e-300, 9.999, 10.0])
 
@@ -118,9 +118,9 @@ def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(pre
         inputs = at(boundary, 1)
         assert np.isfinite(inputs).all()
         assert (inputs >= 0.0).all()
-        assert (inputs[layout.entry_inputs + 1] <= model.largest_speed).all()  # w, of the CFL
-        assert (inputs[layout.entry_inputs] <= model.entry_jam_density * 1.1 * v_f).all()
-        assert (inputs[layout.exit_inputs] <= model.exit_jam_density).all()
+        assert (inputs[road.entry_inputs + 1] <= model.largest_speed).all()  # w, of the CFL
+        assert (inputs[road.entry_inputs] <= jam[road.entry_cells] * 1.1 * v_f).all()
+        assert (inputs[road.exit_inputs] <= jam[road.exit_cells]).all()
         assert np.isfinite(model.step(state, inputs[None])).all()
 
     check()
@@ -161,7 +161,7 @@ def test_boundary_segments_are_released_at_every_step_and_drive_the_next():
 
 @pytest.fixture(params=["paper", "w99-3lane"])
 def model(request):
-    return ARZModel(PAPER_HIGHWAY, load_parameters(request.param))
+    return ARZModel(PAPER_HIGHWAY.road, load_parameters(request.param))
 
 
 def test_flows_add_up_along_the_road_at_the_demand_of_the_moment():
@@ -201,18 +201,18 @@ def test_the_density_carries_the_flow_freely(model):
 
 
 def test_nominal_inputs_are_the_demand_and_the_nominal_state_hardly_moves_under_them(model):
-    inputs, layout, v_f = (
-        nominal_inputs(PAPER_HIGHWAY, model), model.layout, model.parameters.free_flow_speed,
+    inputs, road, v_f = (
+        nominal_inputs(PAPER_HIGHWAY, model), model.road, model.parameters.free_flow_speed,
     )  # fmt: skip
     assert inputs.shape == (701, model.n_inputs)
     rates = [[6050.0 if 200 <= t < 400 else 2050.0, 320.0, 300.0] for t in range(701)]
-    np.testing.assert_allclose(inputs[:, layout.entry_inputs], rates)
-    np.testing.assert_array_equal(inputs[:, layout.entry_inputs + 1], v_f)
+    np.testing.assert_allclose(inputs[:, road.entry_inputs], rates)
+    np.testing.assert_array_equal(inputs[:, road.entry_inputs + 1], v_f)
     # Behind the exits the flow that reaches them is carried freely.
-    jam, density = model.exit_jam_density, inputs[:, layout.exit_inputs]
+    jam, density = model.arz.jam[road.exit_cells], inputs[:, road.exit_inputs]
     carried = density * v_f * (1.0 - (density / jam) ** model.parameters.gamma)
     flows = nominal_flows(PAPER_HIGHWAY, np.arange(701))
-    free = inputs[:, layout.entry_inputs[0]] < 3000.0
+    free = inputs[:, road.entry_inputs[0]] < 3000.0
     np.testing.assert_allclose(carried[free], flows[free][:, [14, 17, 18]], rtol=1e-3)
     state = nominal_state(PAPER_HIGHWAY, model, 0.0)[None]
     after = state

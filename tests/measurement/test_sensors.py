@@ -109,9 +109,9 @@ def test_a_model_that_knows_of_no_groups_is_refused_before_anything_is_recorded(
 def test_queries_count_connected_vehicles_and_sensors_all_in_columns_of_their_own(preset):
     process = begun(preset, privacy={**QUIET, **({"cap": 1_000} if preset == "capped" else {})})
     task = process.release.task
-    assert task.first.tolist() == [*range(8), 3, 5]
+    assert task.channels.first.tolist() == [*range(8), 3, 5]
     assert task.sensors.tolist() == [8, 9, 7]
-    assert task.group.tolist() == [0] * N + [1] * 4
+    assert task.channels.group.tolist() == [0] * N + [1] * 4
     for released, asked, _ in play(process, 20):
         assert np.flatnonzero(asked.observed[0]).tolist() == [0, 3, *COLUMNS]
         every, some = true_counts(process, asked, 0, 3, 7, 3, 5)
@@ -163,7 +163,7 @@ def test_what_is_spent_grows_to_mu_by_the_largest_charges_of_both_groups(preset)
         past = spent
         if preset == "paced" and second < 3:
             paid = np.where(asked.observed[0], 2.0 * release.prices[0], 0.0)
-            charged += [paid[task.group == g].max() for g in (0, 1)]
+            charged += [paid[task.channels.group == g].max() for g in (0, 1)]
             assert spent**2 == pytest.approx(2.0 * charged.sum())
     assert past > 0.5 * mu
 
@@ -188,7 +188,7 @@ def test_a_fork_gives_the_bits_of_its_origin_and_leaves_it_alone(preset, detecto
 
 def test_given_noise_reaches_both_groups():
     process = begun()
-    process.release.give_noise(np.zeros((1, process.release.task.n_columns, 2)))
+    process.release.give_noise(np.zeros((1, process.release.task.n_channels, 2)))
     ((released, asked, _),) = play(process, 1)
     every, some = true_counts(process, asked, 0, 3, 7, 3, 5)
     counts = released.values[0, [0, 3, *COLUMNS], 0] * LENGTH

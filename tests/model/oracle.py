@@ -7,22 +7,22 @@ from itertools import pairwise
 
 import numpy as np
 
-from dptse_env.model import ARZModel, MeasurementRows, load_parameters
+from dptse_env.model import ARZModel, load_parameters
 from dptse_env.model.parameters import STANDING, VACUUM
 from dptse_env.utils.arrays import FloatArray
-from tests.helpers import UNEVEN, Road
+from tests.helpers import UNEVEN, Stretch, make_channels
 
 PAPER = load_parameters("paper")
 W99 = load_parameters("w99-3lane")
 NO_RELAXATION = replace(PAPER, name="no relaxation", relaxation_time=float("inf"))
 
-ROWS = MeasurementRows(np.array([0, 3, 4, 13, 16]), np.array([1, 2, 3, 2, 1]), 19)
-"""Rows of the highway, of one to three segments."""
+CHANNELS = make_channels((0, 3, 4, 13, 16), (1, 2, 3, 2, 1))
+"""Channels of the highway, of one to three segments."""
 
-HIGHWAY = Road(on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
-STRAIGHT = Road()
+HIGHWAY = Stretch(on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
+STRAIGHT = Stretch()
 # Every kind of face beside every other, an off-ramp that nobody takes, and wider roads outside.
-CROWDED = Road(
+CROWDED = Stretch(
     on_ramps=(3, 5), off_ramps=(4, 6), exit_shares=(0.0, 0.5), ramp_lanes=3, more_outside=1
 )
 ROADS = {
@@ -30,7 +30,7 @@ ROADS = {
     "uneven": UNEVEN,
     "crowded": CROWDED,
     "straight": STRAIGHT,
-    "one cell": Road(n_mainline=1),
+    "one cell": Stretch(n_mainline=1),
 }
 
 
@@ -59,7 +59,7 @@ def random_inputs(model: ARZModel, n: int, rng: np.random.Generator) -> FloatArr
     """Inputs of boundary cells all over the cone."""
     per_lane = model.parameters.jam_density / model.parameters.lanes
     density = rng.uniform(0.0, 1.2, (n, model.n_boundaries)) * per_lane
-    density *= np.array(model.network.boundary_lanes)
+    density *= model.road.lanes[model.n_segments :]
     density[rng.random(density.shape) < 0.1] = 0.0
     return model.boundary_inputs(density, rng.uniform(0.0, model.speed_scale, density.shape))
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from dptse_env.model import ARZModel, MeasurementRows
+from dptse_env.model import ARZModel
 from dptse_env.model.columns import (
     advance_states,
     make_batch_scratch,
-    measure_row,
+    measure_channel,
     project_states,
 )
 from dptse_env.model.step import project
-from tests.helpers import UNEVEN, compiled, pairwise
+from tests.helpers import UNEVEN, compiled, make_channels, pairwise
 
 from .oracle import (
     HIGHWAY,
@@ -24,8 +24,8 @@ from .oracle import (
     scattered_states,
 )
 
-advance_states, make_batch_scratch, measure_row, project, project_states = map(
-    compiled, (advance_states, make_batch_scratch, measure_row, project, project_states)
+advance_states, make_batch_scratch, measure_channel, project, project_states = map(
+    compiled, (advance_states, make_batch_scratch, measure_channel, project, project_states)
 )
 
 WIDTH = 104
@@ -36,7 +36,8 @@ everywhere = pytest.mark.parametrize(
 
 def advanced(model, states, inputs):
     columns = states.T.copy()
-    advance_states(model.road, columns, inputs, make_batch_scratch(model.road, len(states)))
+    road, arz, _ = model.dynamics
+    advance_states(road, arz, columns, inputs, make_batch_scratch(model.road, len(states)))
     return columns.T
 
 
@@ -45,8 +46,8 @@ def advanced(model, states, inputs):
 )
 def test_advances_as_the_oracle(road, parameters, demand):
     """Also where the states fill no whole vectors."""
-    model = ARZModel(ROADS[road], parameters, demand_states=demand)
-    oracle, rng = Oracle(model.network, parameters), np.random.default_rng(0)
+    model = ARZModel(ROADS[road].road, parameters, demand_states=demand)
+    oracle, rng = Oracle(ROADS[road], parameters), np.random.default_rng(0)
     for width in (WIDTH, 1, 3, 77) * 10:
         states, inputs = random_states(model, width, rng), random_inputs(model, 1, rng)
         expected = oracle.step(states, np.repeat(inputs, width, axis=0)) / model.state_scale
@@ -57,14 +58,14 @@ def test_advances_as_the_oracle(road, parameters, demand):
 @everywhere
 @pytest.mark.parametrize("bounds", ["cone", "box"])
 def test_kernels_project_one_state_and_many_as_the_model_does(road, parameters, bounds):
-    model, rng = ARZModel(road, parameters, demand_states=True), np.random.default_rng(0)
+    model, rng = ARZModel(road.road, parameters, demand_states=True), np.random.default_rng(0)
     for _ in range(10):
         states = scattered_states(model, WIDTH, rng)
         columns, expected = states.T.copy(), model.project(states, bounds)
-        project_states(model.road, columns, bounds == "box")
+        project_states(model.road, model.arz, columns, bounds == "box")
         assert (model.demand_factors(expected) != model.demand_factors(states)).any()
         for state in states:
-            project(model.road, state, bounds == "box")
+            project(model.road, model.arz, state, bounds == "box")
         scale = model.state_scale
         np.testing.assert_allclose(columns.T / scale, expected / scale, atol=1e-13)
         np.testing.assert_allclose(states / scale, expected / scale, atol=1e-15)
@@ -72,18 +73,18 @@ def test_kernels_project_one_state_and_many_as_the_model_does(road, parameters, 
 
 @everywhere
 @pytest.mark.parametrize("reference_speed", [None, 51.0])
-def test_a_row_of_many_states_is_what_the_model_measures(road, parameters, reference_speed):
+def test_a_channel_of_many_states_is_what_the_model_measures(road, parameters, reference_speed):
     """States with negative components among them, as those of members ahead of a projection."""
-    span = np.array([1, 1, 1] if reference_speed is None else [1, 2, 3])
+    span = (1, 1, 1) if reference_speed is None else (1, 2, 3)
     n = len(road.segment_lengths)
-    rows = MeasurementRows(np.array([n - 1, 0, 2]), span, n)
-    model = ARZModel(road, parameters, reference_speed=reference_speed, rows=rows)
+    channels = make_channels((n - 1, 0, 2), span)
+    model = ARZModel(road.road, parameters, reference_speed=reference_speed, channels=channels)
     rng, width = np.random.default_rng(0), np.empty((3, WIDTH))
     states = scattered_states(model, WIDTH, rng)
     centre = np.full(n, np.nan) if reference_speed is None else rng.uniform(0.0, 100.0, n)
     expected = model.measure(states, centre) / model.measurement_scale
     for m in range(3):
-        measure_row(model.road, m, states.T.copy(), centre, *width)
+        measure_channel(model.arz, channels, m, states.T.copy(), centre, *width)
         found = width[:2].T / model.measurement_scale
         np.testing.assert_allclose(found, expected[:, m], atol=1e-9)
     assert (states[:, 0::2] < 0.0).any()
@@ -91,7 +92,7 @@ def test_a_row_of_many_states_is_what_the_model_measures(road, parameters, refer
 
 @everywhere
 def test_what_is_not_finite_stays_so_in_its_column_or_reaches_all_as_an_input(road, parameters):
-    model, rng = ARZModel(road, parameters), np.random.default_rng(0)
+    model, rng = ARZModel(road.road, parameters), np.random.default_rng(0)
     states, inputs = random_states(model, WIDTH, rng), random_inputs(model, 1, rng)[0]
     clean, rows = advanced(model, states, inputs), np.arange(model.n_states)
     states[rows, rows] = np.nan
@@ -100,7 +101,7 @@ def test_what_is_not_finite_stays_so_in_its_column_or_reaches_all_as_an_input(ro
     np.testing.assert_array_equal(after[rows.size :], clean[rows.size :])
     for is_box in (False, True):
         columns = states.T.copy()
-        project_states(model.road, columns, is_box)
+        project_states(model.road, model.arz, columns, is_box)
         assert np.isnan(columns[rows, rows]).all()
     for column in range(5):  # demand, w, the density behind the exit, and an on-ramp's two
         inputs = random_inputs(model, 1, rng)[0]

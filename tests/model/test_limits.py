@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dptse_env.model import ARZModel
-from tests.helpers import UNEVEN, Road, pairwise
+from tests.helpers import UNEVEN, Stretch, pairwise
 
 from .oracle import (
     HIGHWAY,
@@ -23,9 +23,9 @@ from .oracle import (
 
 seeds = st.integers(0, 2**32 - 1)
 both_sets = pytest.mark.parametrize("parameters", [PAPER, W99], ids=lambda p: p.name)
-PLAIN = Road(n_mainline=4)
-MERGE = Road(n_mainline=4, on_ramps=(2,), ramp_lanes=3)
-DIVERGE = Road(n_mainline=4, off_ramps=(2,), exit_shares=(0.1,))
+PLAIN = Stretch(n_mainline=4)
+MERGE = Stretch(n_mainline=4, on_ramps=(2,), ramp_lanes=3)
+DIVERGE = Stretch(n_mainline=4, off_ramps=(2,), exit_shares=(0.1,))
 
 
 def drawn(model, seed, n=4):
@@ -36,7 +36,7 @@ def drawn(model, seed, n=4):
 def uniform(model, density, w):
     """State and inputs of a straight road in one condition everywhere."""
     rho, jam = np.full((1, model.n_segments), density), model.jam_density[0]
-    demand = Oracle(model.network, model.parameters).demand(np.array(density), w, jam)
+    demand = Oracle(STRAIGHT, model.parameters).demand(np.array(density), w, jam)
     states = model.states(rho, w - model.pressure(rho))
     return states, np.array([[float(demand), w, density]])
 
@@ -48,7 +48,7 @@ def uniform(model, density, w):
 @pytest.mark.parametrize(("filling", "w_share"), [(0.2, 0.9), (0.2, 1.1), (0.05, 0.5), (0.9, 1.0)])
 def test_a_uniform_road_relaxes_by_the_closed_form(parameters, filling, w_share):
     """To an equilibrium, where it stays."""
-    model = ARZModel(STRAIGHT, parameters)
+    model = ARZModel(STRAIGHT.road, parameters)
     v_f, density = parameters.free_flow_speed, filling * parameters.jam_density
     w_0 = max(w_share * v_f, float(model.pressure(density)[0]))
     states, _ = uniform(model, density, w_0)
@@ -94,8 +94,8 @@ def exact(left, right, xi):
 def errors(left, right, n):
     """Mean errors of density and flow, as shares of the jam density and of v_f rho_m / 4."""
     length = 4.0 / n
-    road = Road(n_mainline=n, segment_length=length)
-    model = ARZModel(road, NO_RELAXATION, 0.5 * 1.76 * length / 0.1)
+    road = Stretch(n_mainline=n, segment_length=length)
+    model = ARZModel(road.road, NO_RELAXATION, 0.5 * 1.76 * length / 0.1)
     x = (np.arange(n) + 0.5) * length - 2.0
     rho, speed = np.where(x[:, None] < 0.0, left, right).T[:, None]
     states = model.states(rho, speed)
@@ -127,11 +127,11 @@ def test_converges_to_the_exact_solution_of_the_riemann_problem(left, right):
 )
 @given(seed=seeds)
 def test_what_the_road_holds_changes_by_what_passes_its_ends(road, parameters, seed):
-    model = ARZModel(road, parameters)
+    model = ARZModel(road.road, parameters)
     states, inputs = drawn(model, seed)
     w, q, _, source = Oracle(road, parameters).flows(states, inputs)
     entering, w_in = np.array(list(source.values())).swapaxes(0, 1)
-    lengths, exits = model.layout.lengths, model.layout.exits
+    lengths, exits = model.road.lengths[: model.n_segments], model.road.exits
     change = model.step(states, inputs) - states
     through = (entering.sum(axis=0) - q[exits].sum(axis=0)) / 3600.0
     np.testing.assert_allclose(change[:, 0::2] @ lengths, through, atol=1e-9)
@@ -146,13 +146,13 @@ def test_what_the_road_holds_changes_by_what_passes_its_ends(road, parameters, s
 @given(seed=seeds, largest_w=st.sampled_from([1.0, 1.1]))
 def test_density_stays_positive_and_w_within_its_bounds(road, parameters, seed, largest_w):
     """And nobody drives backwards where no w exceeds the free flow's."""
-    model, v_f = ARZModel(road, parameters), parameters.free_flow_speed
+    model, v_f = ARZModel(road.road, parameters), parameters.free_flow_speed
 
     def w_of(states):  # the plain quotient, in what counts as a vacuum too
         rho, psi = model.components(states)
         return np.divide(psi, rho, np.full_like(rho, v_f), where=rho > 0.0)
 
-    rng, columns = np.random.default_rng(seed), model.layout.entry_inputs + 1
+    rng, columns = np.random.default_rng(seed), model.road.entry_inputs + 1
     states = random_states(model, 4, rng)
     states[:, 1::2] = np.minimum(states[:, 1::2], largest_w * v_f * states[:, 0::2])
     for _ in range(20):
@@ -169,7 +169,7 @@ def test_density_stays_positive_and_w_within_its_bounds(road, parameters, seed, 
 
 
 def test_an_empty_road_stays_empty_and_finite():
-    model = ARZModel(HIGHWAY, PAPER)
+    model = ARZModel(HIGHWAY.road, PAPER)
     states = np.zeros((1, model.n_states))
     inputs = model.boundary_inputs(np.zeros((1, 6)), np.full((1, 6), np.nan))
     np.testing.assert_array_equal(model.step(states, inputs), states)
@@ -179,7 +179,7 @@ def test_an_empty_road_stays_empty_and_finite():
 
 @given(seed=seeds)
 def test_a_merge_with_an_empty_ramp_and_a_diverge_that_nobody_takes_are_plain_faces(seed):
-    merge, plain = ARZModel(MERGE, PAPER), ARZModel(PLAIN, PAPER)
+    merge, plain = ARZModel(MERGE.road, PAPER), ARZModel(PLAIN.road, PAPER)
     states, inputs = drawn(merge, seed)
     states[:, 8:], inputs[:, 3] = 0.0, 0.0
     straight, merged = plain.step(states[:, :8], inputs[:, :3]), merge.step(states, inputs)
@@ -187,6 +187,6 @@ def test_a_merge_with_an_empty_ramp_and_a_diverge_that_nobody_takes_are_plain_fa
     np.testing.assert_array_equal(merged[:, 8:], 0.0)
     states[:, 8:] = 30.0, 30.0 * 102.0  # a ramp that takes in something, however little
     for share, atol in ((0.0, 1e-7), (1e-12, 1e-4)):
-        diverge = ARZModel(replace(DIVERGE, exit_shares=(share,)), PAPER)
+        diverge = ARZModel(replace(DIVERGE, exit_shares=(share,)).road, PAPER)
         through = diverge.step(states, inputs[:, [0, 1, 2, 3]])
         np.testing.assert_allclose(through[:, :8], straight, rtol=1e-9, atol=atol)

@@ -7,14 +7,14 @@ from dptse_env.model import ARZModel
 from dptse_env.model.parameters import MEASUREMENT_FLOOR
 from tests.helpers import pairwise
 
-from .oracle import HIGHWAY, PAPER, ROWS, W99, random_states
+from .oracle import CHANNELS, HIGHWAY, PAPER, W99, random_states
 
 both_sets = pytest.mark.parametrize("parameters", [PAPER, W99], ids=lambda p: p.name)
 
 
 @both_sets
 def test_measures_density_and_speed_of_segments_or_averages_of_flows_around_a_centre(parameters):
-    model, rng = ARZModel(HIGHWAY, parameters), np.random.default_rng(5)
+    model, rng = ARZModel(HIGHWAY.road, parameters), np.random.default_rng(5)
     density = rng.uniform(0.02, 0.9, (6, 19)) * model.jam_density
     speed, centre = rng.uniform(0.0, 100.0, (2, 6, 19))
     states, scale = model.states(density, speed), model.density_scale
@@ -23,9 +23,9 @@ def test_measures_density_and_speed_of_segments_or_averages_of_flows_around_a_ce
     np.testing.assert_allclose(model.density(states), density)
     np.testing.assert_allclose(model.speed(states), speed, atol=1e-9)
     np.testing.assert_array_equal(model.measurement_scale, [scale, model.speed_scale])
-    flows = ARZModel(HIGHWAY, parameters, reference_speed=51.0, rows=ROWS)
+    flows = ARZModel(HIGHWAY.road, parameters, reference_speed=51.0, channels=CHANNELS)
     for given, v_0 in ((None, 51.0), (centre, centre)):
-        expected = ROWS.averages(np.stack([density, density * (speed - v_0)], axis=-1))
+        expected = flows.averages(np.stack([density, density * (speed - v_0)], axis=-1))
         np.testing.assert_allclose(flows.measure(states, given), expected, rtol=1e-9, atol=1e-6)
     np.testing.assert_array_equal(flows.measurement_scale, [scale, scale * model.speed_scale])
     # Density and speed stay what they are, for those who ask for these.
@@ -37,9 +37,10 @@ def test_measures_density_and_speed_of_segments_or_averages_of_flows_around_a_ce
     pairwise([PAPER, W99], ["speeds", "flows", "rows"], [False, True]),
 )
 def test_the_measurement_matrix_is_that_of_central_differences(parameters, release, demand):
+    speed = None if release == "speeds" else 51.0
     model = ARZModel(
-        HIGHWAY, parameters, reference_speed=None if release == "speeds" else 51.0,
-        rows=ROWS if release == "rows" else None, demand_states=demand,
+        HIGHWAY.road, parameters, reference_speed=speed,
+        channels=CHANNELS if release == "rows" else None, demand_states=demand,
     )  # fmt: skip
     rng, floor = np.random.default_rng(1), MEASUREMENT_FLOOR * model.jam_density
     density = rng.uniform(0.0, 1.0, (20, 19)) ** 3 * model.jam_density
@@ -59,14 +60,14 @@ def test_the_measurement_matrix_is_that_of_central_differences(parameters, relea
 def test_impossible_sensors_are_refused():
     for bad in (-1.0, np.nan, np.inf, "fast"):
         with pytest.raises(ValueError, match=r"model\.reference_speed must be .*, got "):
-            ARZModel(HIGHWAY, PAPER, reference_speed=bad)
-    with pytest.raises(ValueError, match=r"model\.rows must be single segments"):
-        ARZModel(HIGHWAY, W99, rows=ROWS)  # mean speeds have no sum
+            ARZModel(HIGHWAY.road, PAPER, reference_speed=bad)
+    with pytest.raises(ValueError, match=r"model\.channels must be segments"):
+        ARZModel(HIGHWAY.road, W99, channels=CHANNELS)  # mean speeds have no sum
 
 
 @both_sets
 def test_the_cone_holds_speed_and_w_and_leaves_what_is_inside_alone(parameters):
-    model, rng = ARZModel(HIGHWAY, parameters), np.random.default_rng(2)
+    model, rng = ARZModel(HIGHWAY.road, parameters), np.random.default_rng(2)
     states = model.project(rng.normal(0.0, 3.0, (200, 38)) * model.state_scale)
     density, psi = model.components(states)
     w = psi / density
@@ -84,7 +85,7 @@ def test_the_cone_holds_speed_and_w_and_leaves_what_is_inside_alone(parameters):
 
 
 def test_the_box_is_the_papers_and_factors_have_bounds_of_their_own():
-    model = ARZModel(HIGHWAY, PAPER, demand_states=True)
+    model = ARZModel(HIGHWAY.road, PAPER, demand_states=True)
     assert (model.n_demand_states, model.n_states) == (3, 41)
     np.testing.assert_array_equal(model.state_scale[-3:], np.ones(3))
     wild = np.random.default_rng(3).normal(0.0, 3.0, (200, 41)) * model.state_scale
@@ -101,8 +102,9 @@ def test_the_box_is_the_papers_and_factors_have_bounds_of_their_own():
 
 
 def test_boundary_inputs_follow_the_order_of_the_input_vector():
-    model = ARZModel(HIGHWAY, PAPER)
-    np.testing.assert_allclose(model.entry_jam_density, [333.0, 111.0, 111.0])
+    model = ARZModel(HIGHWAY.road, PAPER)
+    jam = model.arz.jam[model.road.entry_cells]
+    np.testing.assert_allclose(jam, [333.0, 111.0, 111.0])
     density = np.array([[30.0, 40.0, 6.0, 7.0, 8.0, 9.0]])
     speed = np.array([[90.0, 80.0, 70.0, 60.0, 50.0, 40.0]])
     inputs = model.boundary_inputs(density, speed)[0]
@@ -114,7 +116,7 @@ def test_boundary_inputs_follow_the_order_of_the_input_vector():
 
 def test_a_boundary_cell_demands_its_capacity_or_nothing_and_w_keeps_the_cfl_condition():
     def inputs(density, speed):
-        return ARZModel(HIGHWAY, PAPER).boundary_inputs(
+        return ARZModel(HIGHWAY.road, PAPER).boundary_inputs(
             np.full((1, 6), density), np.full((1, 6), speed)
         )[0]
 

@@ -69,10 +69,10 @@ def test_written_set_reads_back_with_its_provenance(tmp_path):
 
 @pytest.mark.parametrize("time_step", [1.77, 0.0, -1.0, float("nan")])
 def test_a_step_too_long_names_the_longest_admissible(time_step):
-    model = ARZModel(HIGHWAY, PAPER, time_step)
+    model = ARZModel(HIGHWAY.road, PAPER, time_step)
     with pytest.raises(ValueError, match=r"CFL condition needs a time step > 0 and at most 1.76 s"):
-        model.road  # noqa: B018
-    assert ARZModel(HIGHWAY, PAPER, 1.76).road.relaxation > 0
+        model.dynamics  # noqa: B018
+    assert ARZModel(HIGHWAY.road, PAPER, 1.76).dynamics[1].relaxation > 0
 
 
 def test_strong_relaxation_a_large_gamma_and_the_shortest_segment_bound_the_step_too():
@@ -82,7 +82,7 @@ def test_strong_relaxation_a_large_gamma_and_the_shortest_segment_bound_the_step
         (PAPER, UNEVEN, r"at least (0\.\d+) km .*, got 0\.08 km"),
     ):
         with pytest.raises(ValueError, match=message) as refused:
-            ARZModel(road, parameters, 1.6).require_time_step()
+            ARZModel(road.road, parameters, 1.6).require_time_step()
     # The shortest segment that is named is admissible, and none that is shorter.
     least = float(re.findall(r"at least (0\.\d+) km", str(refused.value))[0])
     assert PAPER.largest_time_step(least - 1e-4) < 1.6 <= PAPER.largest_time_step(least)

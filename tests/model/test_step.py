@@ -8,16 +8,16 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from dptse_env.model import ARZModel, MeasurementRows
-from dptse_env.model.step import advance, make_scratch, write_row
-from tests.helpers import UNEVEN, compiled, pairwise
+from dptse_env.model import ARZModel, Channels
+from dptse_env.model.step import advance, make_scratch, write_channel
+from tests.helpers import UNEVEN, compiled, make_channels, pairwise
 
 from .oracle import (
+    CHANNELS,
     HIGHWAY,
     NO_RELAXATION,
     PAPER,
     ROADS,
-    ROWS,
     STRAIGHT,
     W99,
     Oracle,
@@ -26,7 +26,7 @@ from .oracle import (
     scattered_states,
 )
 
-advance, make_scratch, write_row = map(compiled, (advance, make_scratch, write_row))
+advance, make_scratch, write_channel = map(compiled, (advance, make_scratch, write_channel))
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ advance, make_scratch, write_row = map(compiled, (advance, make_scratch, write_r
 @example(seed=405074828)  # a gap w - v of one rounding, whose power has a steep derivative
 @given(seed=st.integers(0, 2**32 - 1))
 def test_equals_the_oracle(road, parameters, demand, seed):
-    model = ARZModel(ROADS[road], parameters, demand_states=demand)
+    model = ARZModel(ROADS[road].road, parameters, demand_states=demand)
     oracle, rng = Oracle(ROADS[road], parameters), np.random.default_rng(seed)
     scale = model.state_scale
     states, inputs = random_states(model, 4, rng), random_inputs(model, 4, rng)
@@ -53,7 +53,7 @@ def test_equals_the_oracle(road, parameters, demand, seed):
 
 def test_standing_traffic_takes_the_derivative_of_moving_traffic():
     """The cone's edge v = 0 is a kink; rounding must not choose the side."""
-    model = ARZModel(STRAIGHT, PAPER)
+    model = ARZModel(STRAIGHT.road, PAPER)
     at_rest = model.states(np.full((1, 15), 200.0), np.zeros((1, 15)))
     inputs = np.array([[1000.0, 102.0, 150.0]])
     below, at, above = (model.jacobian(at_rest * (1.0 + e), inputs) for e in (-1e-14, 0.0, 1e-14))
@@ -63,7 +63,7 @@ def test_standing_traffic_takes_the_derivative_of_moving_traffic():
 
 
 def test_a_batch_equals_a_loop_a_copy_and_a_kernel_that_overwrites_its_state_to_the_bit():
-    model, rng = ARZModel(HIGHWAY, W99, demand_states=True), np.random.default_rng(8)
+    model, rng = ARZModel(HIGHWAY.road, W99, demand_states=True), np.random.default_rng(8)
     states, inputs = random_states(model, 16, rng), random_inputs(model, 16, rng)
     kept = states.copy()
     after, jacobian = model.step(states[::2], inputs[::2]), model.jacobian(states[::2], inputs[::2])
@@ -75,21 +75,21 @@ def test_a_batch_equals_a_loop_a_copy_and_a_kernel_that_overwrites_its_state_to_
             np.testing.assert_array_equal(other.step(states[row], inputs[row])[0], after[i])
         np.testing.assert_array_equal(model.jacobian(states[row], inputs[row])[0], jacobian[i])
         state, blocks = states[one].copy(), np.empty((*model.road.neighbours.shape, 4))
-        advance(model.road, state, inputs[one], state, blocks, make_scratch(model.road))
+        advance(model.road, model.arz, state, inputs[one], state, blocks, make_scratch(model.road))
         np.testing.assert_array_equal(state, after[i])
 
 
 @pytest.mark.parametrize(
-    ("road", "rows", "speed", "demand"),
+    ("road", "channels", "speed", "demand"),
     [
-        (HIGHWAY, MeasurementRows.single(19), None, False),
-        (HIGHWAY, ROWS, 51.0, True),
-        (UNEVEN, MeasurementRows(np.array([6, 0, 2]), np.array([2, 1, 3]), 15), 51.0, False),
+        (HIGHWAY, Channels.of_segments(HIGHWAY.road), None, False),
+        (HIGHWAY, CHANNELS, 51.0, True),
+        (UNEVEN, make_channels((6, 0, 2), (2, 1, 3)), 51.0, False),
     ],
 )
-def test_a_kernels_row_is_the_models_measurement_linearised(road, rows, speed, demand):
+def test_a_kernels_channel_is_the_models_measurement_linearised(road, channels, speed, demand):
     """Empty segments and negative densities among them, as a filter may have."""
-    model = ARZModel(road, W99, reference_speed=speed, rows=rows, demand_states=demand)
+    model = ARZModel(road.road, W99, reference_speed=speed, channels=channels, demand_states=demand)
     rng = np.random.default_rng(2)
     states = scattered_states(model, 20, rng)
     assert (model.components(states)[0] < 0.0).any(axis=0).mean() > 0.8
@@ -100,8 +100,10 @@ def test_a_kernels_row_is_the_models_measurement_linearised(road, rows, speed, d
     matrix *= model.state_scale
     weights, constants = np.full((2, 6), np.nan), np.empty(2)
     for i, state in enumerate(states):
-        for m, (first, span) in enumerate(zip(rows.first, rows.span, strict=True)):
-            write_row(model.road, model.state_scale, state, centre[i], m, weights, constants)
+        for m, (first, span) in enumerate(zip(channels.first, channels.span, strict=True)):
+            write_channel(
+                model.arz, channels, model.state_scale, state, centre[i], m, weights, constants
+            )
             covered = slice(2 * first, 2 * (first + span))
             written, unit = weights[:, : 2 * span], model.state_scale[covered]
             np.testing.assert_allclose(written, matrix[i, m][:, covered], rtol=1e-12, atol=1e-12)

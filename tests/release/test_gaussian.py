@@ -100,8 +100,8 @@ def test_an_empty_segment_or_sensor_has_its_own_speed_limit(groups):
     empty = Worlds(stays(0, 0.0, 1, present=False), road=road)
     release = empty.started(PrivacySettings("paper"), groups=groups)
     every, task = np.array(road.with_boundaries(road.speed_limits)), release.task
-    found = release.true_values(request(1, n_columns=task.n_columns))
-    np.testing.assert_array_equal(found[0, :, 1], every[task.first])
+    found = release.true_values(request(1, n_columns=task.n_channels))
+    np.testing.assert_array_equal(found[0, :, 1], every[task.channels.first])
     assert {60.0, LIMIT} == set(every)
 
 
@@ -141,7 +141,7 @@ def test_a_vehicle_counts_alike_on_every_segment_in_units_of_the_noise(preset):
     release = Worlds(crowd(200, last=n_columns, n_columns=n_columns), road=road).started(asked)
     every = request(1, n_columns=n_columns)
     released, true = release.release(every), release.true_values(every)
-    lengths = release.task.length
+    lengths = release.task.channels.length
     np.testing.assert_allclose(
         lengths * released.sigma[0, :, 0], min(lengths) * release.sigma[0], rtol=1e-12
     )
@@ -166,7 +166,7 @@ def squared_distance(release, queries, std=None):
     release.reset(BOTH, streams(1, 2))
     total = 0.0
     for t, observed in enumerate(queries, 1):
-        asked = request(t, observed, episodes=BOTH, n_columns=release.task.n_columns)
+        asked = request(t, observed, episodes=BOTH, n_columns=release.task.n_channels)
         first, second = release.true_values(asked)
         total += float(np.sum((((first - second) / std)[observed]) ** 2))
     return total
@@ -191,7 +191,7 @@ def test_no_policy_exceeds_mu(data):
     groups = data.draw(st.sampled_from([WHOLE, TWO_GROUPS]))
     worlds = Worlds(record(places, speeds), record(other_places, other_speeds))
     release = worlds.release(asked, groups=groups)
-    first = release.task.first
+    first = release.task.channels.first
     queries = np.random.default_rng(data.draw(st.integers(0, 99))).random((T, first.size)) < 0.5
     if data.draw(st.booleans()):
         trips = np.stack([places[0, 1:], other_places[0, 1:]], axis=1)

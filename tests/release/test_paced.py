@@ -64,7 +64,7 @@ def started(worlds=WANDERER, **wish):
 class QuietNoise(Paced):
     def __init__(self, task, traffic):
         super().__init__(task, traffic)
-        self.noise = Noise(task.n_episodes, task.n_columns, scale=1.0 / 1.41)
+        self.noise = Noise(task.n_episodes, task.n_channels, scale=1.0 / 1.41)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_residuals_are_white_and_of_the_stated_size_but_for_less_noise(wish, kin
         Worlds(crowd()).started(PacedSettings(**wish), 3, kind=each, groups=groups)
         for each in (kind, None)
     )
-    n_columns, true, released = release.task.n_columns, [], []
+    n_columns, true, released = release.task.n_channels, [], []
     for second in np.tile(ROUNDS, 80).tolist():
         asked = request(
             second, prediction=predicting(np.linspace(5.0, 90.0, 8)), n_columns=n_columns
@@ -257,7 +257,7 @@ def test_the_account_bounds_every_ledger_and_never_decreases(data):
     )
     spans = data.draw(st.sampled_from([(1,), (1, 2)]))
     release = Worlds(crowd(15)).started(asked, 1, spans=spans)
-    n_columns, n_options = release.task.n_columns, release.task.queries.n_options
+    n_columns, n_options = release.task.n_channels, release.task.queries.n_options
     generator = np.random.default_rng(data.draw(SEEDS))
     squares = 2.0 if asked.adjacency == "replace" else 1.0
     mu, epsilon = 0.0, 0.0
@@ -278,7 +278,7 @@ def test_where_queries_overlap_the_account_adds_what_a_vehicle_pays_for_all_of_t
     asked = PacedSettings(epsilon=5.0, pace=0.2)
     release = Worlds(stays(1, 0.0)).started(asked, spans=(1, 2), bandwidth=6)
     # Segment 1, and the pairs that begin on 0 and on 1; another covers other segments.
-    n_columns = release.task.n_columns
+    n_columns = release.task.n_channels
     observed = np.isin(np.arange(n_columns), [1, 6, 7, 3])
     for second in range(1, 4):
         release.release(request(second, observed, predicting(10.0, 80.0), n_columns=n_columns))
@@ -345,7 +345,7 @@ def test_nothing_public_exceeds_mu(data):
         spans=data.draw(st.sampled_from([(1,), (1, 2, 3)])),
         bandwidth=6,
     )
-    shape, generator = (T, release.task.n_columns), np.random.default_rng(data.draw(SEEDS))
+    shape, generator = (T, release.task.n_channels), np.random.default_rng(data.draw(SEEDS))
     extremes = generator.choice([0.0, LIMIT / 2, LIMIT, np.nan], (T, COLUMNS))
     public = Public(
         generator.random(shape) < generator.choice([0.2, 0.8]),

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from dptse_env.model.network import make_layout
 from dptse_env.release import Group, Paced, PacedSettings, QueryOptions
 from dptse_env.release.pacing import EventPacing, TripPacing
 from dptse_env.traffic import SHORT_HIGHWAY
@@ -39,7 +38,7 @@ def make(
 def prices_of(pacing, observed, density=10.0, speed=60.0, episodes=ONE):
     """Prices of a second of some episodes; columns are observed by index or by flags."""
     task = pacing.task
-    flags = np.zeros((len(episodes), task.n_columns), dtype=bool)
+    flags = np.zeros((len(episodes), task.n_channels), dtype=bool)
     flags[:, observed] = True
     shape = len(episodes), task.corridor.n_segments
     given = (np.broadcast_to(value, shape).astype(float) for value in (density, speed))
@@ -58,19 +57,19 @@ class PlainTracer:
 
     def __init__(self, task, group):
         self.task, self.budget = task, BUDGET * task.shares[group]
-        self.layout, self.columns = make_layout(task.corridor), np.flatnonzero(task.group == group)
+        self.road, self.columns = task.corridor.road, np.flatnonzero(task.channels.group == group)
         queries, always = task.queries, [c for c in task.always if c in self.columns]
-        self.rate, self.tracer = np.zeros((2, task.n_places))
-        self.rate[task.first[always]] = 1.0
+        self.rate, self.tracer = np.zeros((2, task.n_cells))
+        self.rate[task.channels.first[always]] = 1.0
         if group == 0:
             bought = queries.bandwidth * np.mean(queries.span / queries.cost)
             every = self.rate[: queries.n_mainline]
             np.maximum(every, min(bought / queries.n_mainline, 1.0), out=every)
         # Boundary segments before the entries and after the exits, where they are released.
-        own = np.arange(len(self.layout.lengths), task.n_places)
-        before, after = self.layout.entry_boundaries, self.layout.exit_boundaries
-        self.before = dict(zip(self.layout.entries, own[before], strict=True)) if own.size else {}
-        self.after = dict(zip(self.layout.exits, own[after], strict=True)) if own.size else {}
+        road, released = self.road, task.n_cells > self.road.n_segments
+        self.lengths = road.lengths[: road.n_segments]
+        self.before = dict(zip(road.entries, road.entry_cells, strict=True)) if released else {}
+        self.after = dict(zip(road.exits, road.exit_cells, strict=True)) if released else {}
 
     def prices(self, observed, density, speed):
         """Prices of the group's columns."""
@@ -79,7 +78,8 @@ class PlainTracer:
         left = np.maximum(PACE * self.budget - self.tracer, 0.01 * self.budget)
         prices, seen = {}, np.zeros_like(self.tracer)
         for c in self.columns:
-            covered = slice(self.task.first[c], self.task.first[c] + self.task.span[c])
+            first = self.task.channels.first[c]
+            covered = slice(first, first + self.task.channels.span[c])
             prices[c] = (left[covered] / rest[covered]).mean()
             if observed[c]:
                 seen[covered] += prices[c]
@@ -89,22 +89,22 @@ class PlainTracer:
 
     def carried(self, density, speed):
         """The tracer after predicted flows have mixed it for a second."""
-        layout, old, new = self.layout, self.tracer, self.tracer.copy()
+        road, old, new = self.road, self.tracer, self.tracer.copy()
         flow = density * speed
-        for s, length in enumerate(layout.lengths):
+        for s, length in enumerate(self.lengths):
             arriving = [
                 (share * flow[start], old[start])
-                for (start, end), share in zip(layout.edges, layout.edge_shares, strict=True)
+                for (start, end), share in zip(road.edges, road.edge_share, strict=True)
                 if end == s
             ]
-            if s in layout.entries:
+            if s in road.entries:
                 arriving.append((flow[s], old[self.before[s]] if s in self.before else 0.0))
             total = sum(each for each, _ in arriving)
             if total > 0.0:
                 part = min(total / 3600.0 / (length * max(density[s], 1e-9)), 1.0)
                 mean = sum(each * tracer for each, tracer in arriving) / total
                 new[s] = old[s] + part * (mean - old[s])
-        moved = np.minimum(speed / 3600.0 / layout.lengths, 1.0)
+        moved = np.minimum(speed / 3600.0 / self.lengths, 1.0)
         for s, place in self.before.items():  # vehicles enter with nothing
             new[place] = old[place] * (1.0 - moved[s])
         for s, place in self.after.items():
@@ -113,9 +113,9 @@ class PlainTracer:
 
     def remaining(self, speed):
         """Queried seconds to the end of a trip that keeps to the mainline where it can."""
-        seconds, rest = seconds_on(speed, self.layout.lengths), np.zeros_like(self.tracer)
+        seconds, rest = seconds_on(speed, self.lengths), np.zeros_like(self.tracer)
         # Of two that follow, the lower one is on the mainline.
-        following = dict(sorted(map(tuple, self.layout.edges), reverse=True))
+        following = dict(sorted(map(tuple, self.road.edges), reverse=True))
 
         def of(s):
             ahead = of(following[s]) if s in following else 2.0
@@ -149,7 +149,7 @@ def test_prices_and_the_tracer_are_as_when_written_out(keywords):
     for second in range(150):
         density = generator.choice([0.0, 10.0, 60.0, 250.0], n_segments)
         speed = generator.choice([STANDING, 4.0, 30.0, 100.0, 400.0], n_segments)
-        observed = generator.random(task.n_columns) < 0.5
+        observed = generator.random(task.n_channels) < 0.5
         if second < 60:  # the first segments are queried all the time, and traffic stands there
             observed[:2], speed[:3] = True, STANDING
         (found,) = prices_of(pacing, observed, density, speed)
@@ -208,7 +208,7 @@ def test_episodes_do_not_meet_and_a_reset_begins_anew():
 @pytest.mark.parametrize("seed", range(2))
 def test_a_second_s_budget_covers_all_queries_of_a_segment(seed):
     pacing = make(EventPacing, spans=(1, 2, 3))
-    observed = np.random.default_rng(seed).random(pacing.task.n_columns) < 0.3
+    observed = np.random.default_rng(seed).random(pacing.task.n_channels) < 0.3
     prices = prices_of(pacing, observed)[0]
     whole = BUDGET / (1.0 + RATIO)
     sums = (prices * observed) @ pacing.task.covers

@@ -46,8 +46,7 @@ def test_the_bandwidth_pays_for_so_many_queries(bandwidth, spans, unit, most):
 def test_plain_options_are_the_segments():
     options, queried = QueryOptions.make(6, 3), flags(6, 1, 4)
     assert options.are_segments
-    assert options.rows(ROAD).are_single
-    assert options.sensor_rows(ROAD) == ROAD.fixed_sensors
+    assert options.sensor_channels(ROAD) == ROAD.fixed_sensors
     np.testing.assert_array_equal(options.covered(queried), queried)
     assert not np.shares_memory(options.covered(queried), queried)
     assert not any(QueryOptions.make(6, 3, spans).are_segments for spans in ((2,), (1, 2)))
@@ -61,13 +60,11 @@ def test_plain_options_are_the_segments():
         ((1, 2), True, [13, 12, 14]),
     ],
 )
-def test_rows_are_options_then_ramps_then_sensors_without_an_option(spans, separate, sensors):
+def test_channels_are_options_then_ramps_then_sensors_without_an_option(spans, separate, sensors):
     options = QueryOptions.make(6, 4, spans, separate_sensors=separate)
-    rows, found, n = options.rows(ROAD), list(options.sensor_rows(ROAD)), options.n_options
+    first = [*options.first.tolist(), *options.others(ROAD)]
+    found = list(options.sensor_channels(ROAD))
     assert found == sensors
-    assert rows.first[found].tolist() == [5, 7, 2]
-    assert rows.span[found].tolist() == [1, 1, 1]
-    assert rows.first[n : n + 2].tolist() == [6, 7]
-    assert rows.n_rows == max(n + 2, *(row + 1 for row in sensors))
-    assert rows.n_segments == 8
-    np.testing.assert_array_equal(rows.span[:n], options.span)
+    assert [first[channel] for channel in found] == [5, 7, 2]
+    assert first[options.n_options :][:2] == [6, 7]
+    assert len(first) == max(options.n_options + 2, *(channel + 1 for channel in sensors))

@@ -16,33 +16,31 @@ def task(boundary="nominal", preset=SumRelease, **keywords):
     return make_task(resolve("short-highway", {"privacy": privacy, "corridor": road, **keywords}))
 
 
-def test_columns_are_rows_of_the_road_and_then_boundary_segments():
+def test_channels_are_those_of_the_road_and_then_boundary_cells():
     plain, sums, private = task(), task(query_spans=(2,)), task("private", query_spans=(2,))
-    assert [each.n_columns for each in (plain, sums, private)] == [8, 5 + 2 + 2, 5 + 2 + 2 + 4]
-    assert [each.n_places for each in (plain, sums, private)] == [8, 8, 12]
+    assert [each.n_channels for each in (plain, sums, private)] == [8, 5 + 2 + 2, 5 + 2 + 2 + 4]
+    assert [each.n_cells for each in (plain, sums, private)] == [8, 8, 12]
     assert plain.always.tolist() == [5, 7, 2]
     assert private.always.tolist() == [7, 6, 8, *range(9, 13)]
-    np.testing.assert_allclose(private.length, [0.2] * 5 + [0.1] * 8)
+    np.testing.assert_allclose(private.channels.length, [0.2] * 5 + [0.1] * 8)
     observed = private.observed(np.isin(np.arange(5), [0, 2])[None])
     assert np.flatnonzero(observed).tolist() == [0, 2, *range(6, 13)]
     assert np.flatnonzero(private.covered(observed)).tolist() == [0, 1, 2, 3, 5]
-    np.testing.assert_array_equal(private.covers.sum(axis=1), private.span)
+    np.testing.assert_array_equal(private.covers.sum(axis=1), private.channels.span)
     assert np.flatnonzero(private.covers[2]).tolist() == [2, 3]
 
 
-def test_lengths_and_limits_are_those_of_what_a_column_covers():
+def test_a_channel_is_as_long_as_what_it_covers():
     settings = PrivacySettings("corrected", boundary_inputs="private")
     options = QueryOptions.make(UNEVEN.n_mainline, 2)
     uneven = task_of(Corrected, settings, UNEVEN, options)
-    every = UNEVEN.with_boundaries
-    np.testing.assert_array_equal(uneven.length, every(UNEVEN.segment_lengths))
-    np.testing.assert_array_equal(uneven.limit, every(UNEVEN.speed_limits))
+    np.testing.assert_array_equal(uneven.channels.length, UNEVEN.road.lengths)
 
 
-def test_a_model_has_the_rows_and_the_centre_of_the_task():
+def test_a_model_has_the_channels_and_the_centre_of_the_task():
     config = resolve("short-highway", {"privacy": SumRelease, "query_spans": (1, 2)})
     model, expected = make_model(config), make_task(config)
-    np.testing.assert_array_equal(model.rows.first, expected.rows.first)
-    np.testing.assert_array_equal(model.rows.span, expected.rows.span)
+    np.testing.assert_array_equal(model.channels.first, expected.channels.first)
+    np.testing.assert_array_equal(model.channels.span, expected.channels.span)
     assert model.reference_speed == expected.flow_centre == 0.5 * config.corridor.speed_limit
     assert not task(preset=MeanRelease).releases_flow

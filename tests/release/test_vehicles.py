@@ -91,10 +91,10 @@ def test_ledgers_count_as_they_do_when_written_out(spans, groups, ratio):
         worlds.started(PacedSettings(ratio=ratio, clip=25.3), ledgers=kind, **given)
         for kind in (None, PlainLedgers)
     )
-    budget, generator, shape = made.budget, np.random.default_rng(0), (T, made.task.n_columns)
+    budget, generator, shape = made.budget, np.random.default_rng(0), (T, made.task.n_channels)
     public = Public(
         generator.random(shape) < 0.6,
-        generator.uniform(0.0, 0.3, shape) * budget[made.task.group],
+        generator.uniform(0.0, 0.3, shape) * budget[made.task.channels.group],
         generator.uniform(0.0, LIMIT, (T, COLUMNS)),
     )
     seconds = zip(collected(made, public), collected(plain, public), strict=True)

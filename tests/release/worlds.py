@@ -86,7 +86,7 @@ class Worlds:
         if ledgers is not None:
             own = release.ledgers
             numbers = {name: getattr(own, name) for name in ("ratio", "clip", "fastest")}
-            release.ledgers = ledgers(release.task.columns, n, own.budget, **numbers)
+            release.ledgers = ledgers(release.task.channels, n, own.budget, **numbers)
         release.reset(np.arange(n), streams(*range(seed, seed + n)))
         return release
 
@@ -149,13 +149,13 @@ class Public(NamedTuple):
     @classmethod
     def constant(cls, release, price, centre=LIMIT / 2):
         """All columns at the same price around the same centre, at every second."""
-        shape = T, release.task.n_columns
+        shape = T, release.task.n_channels
         return cls(np.ones(shape, bool), np.full(shape, price), np.full((T, COLUMNS), centre))
 
 
 def collected(release, public):
     """Yield the true sums and the refusals of every second of all episodes of a paced release."""
-    episodes, n_columns = np.arange(release.task.n_episodes), release.task.n_columns
+    episodes, n_columns = np.arange(release.task.n_episodes), release.task.n_channels
     for second, numbers in enumerate(zip(*public, strict=True), 1):
         observed, prices, centre = (np.tile(each, (episodes.size, 1)) for each in numbers)
         asked = request(second, observed, episodes=episodes, n_columns=n_columns)
@@ -185,7 +185,7 @@ class PlainLedgers(Ledgers):
     """Ledgers written out in Python."""
 
     def collect(self, episodes, observed, rows, prices, centre, sigma):
-        first, span, group = self._columns
+        first, span, group, _ = self._channels
         sums = np.zeros((*observed.shape, 2))
         refused = np.zeros((len(observed), self.budget.size), dtype=np.int64)
         for k, episode in enumerate(episodes.tolist()):

@@ -30,7 +30,9 @@ class Plain:
             F = model.jacobian(mean, inputs)[0, :n, :n] * scale / scale[:, None]
             mean = model.project(model.step(mean, inputs), settings.bounds)
         self.P = F @ P @ F.T + Q
-        rows = model.measurement_matrix(mean)[0, np.unique(model.rows.first, return_index=True)[1]]
+        rows = model.measurement_matrix(mean)[
+            0, np.unique(model.channels.first, return_index=True)[1]
+        ]
         self.H = (rows[:, :, :n] * scale / model.measurement_scale[:, None]).reshape(n, n)
         sigma = np.array(settings.noise_scale) * process.expected_sigma / model.measurement_scale
         self.R = np.tile(sigma**2, model.n_segments)

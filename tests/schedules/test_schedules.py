@@ -160,7 +160,7 @@ def test_the_oracle_of_gains_asks_what_forks_without_noise_find_best(keywords):
         rewards = np.empty((3, 6))
         for segment in range(6):
             ahead = process.fork()
-            ahead.release.give_noise(np.zeros((3, ahead.release.task.n_columns, 2)))
+            ahead.release.give_noise(np.zeros((3, ahead.release.task.n_channels, 2)))
             queried = np.tile(np.arange(6) == segment, (3, 1)).astype(np.int8)
             rewards[:, segment] = ahead.step(EVERY, queried).reward
         best = np.argsort(-rewards, axis=1, kind="stable")[:, :2]

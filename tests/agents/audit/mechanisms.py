@@ -96,7 +96,7 @@ def noisy(base, kind):
     class Noisy(base):
         def __init__(self, task, traffic):
             super().__init__(task, traffic)
-            self.noise = kind(task.n_episodes, task.n_columns)
+            self.noise = kind(task.n_episodes, task.n_channels)
 
     return Noisy
 

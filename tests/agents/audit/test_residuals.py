@@ -39,7 +39,7 @@ def test_residuals_are_the_noise_of_what_was_released(base, record):
     seen = np.isfinite(residuals)
     np.testing.assert_allclose(residuals[seen], drawn[seen], atol=2e-3)
     # Two queries and a sensor in each second, of which one may be the same.
-    assert make_task(setting).n_columns > seen.any(axis=2).sum(axis=1).min() >= 2
+    assert make_task(setting).n_channels > seen.any(axis=2).sum(axis=1).min() >= 2
     again, other = residuals_of(setting, record), residuals_of(setting, record, seed=1)
     np.testing.assert_array_equal(again, residuals)
     assert not np.array_equal(other, residuals, equal_nan=True)

@@ -110,7 +110,7 @@ def test_gains_are_those_of_episodes_run_apart(round_of_swaps):
         for action in policy.queried[:first]:
             env.step(action)
         if signs is None:
-            shape = (3, env.process.release.task.n_columns, 2)
+            shape = (3, env.process.release.task.n_channels, 2)
             signs = generator.choice([-1.0, 1.0], size=shape)
         env.process.release.give_noise(sign * signs)
         query = policy.queried[first].copy()

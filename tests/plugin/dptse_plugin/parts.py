@@ -79,7 +79,7 @@ class LaplaceRelease(ReleaseModel):
         self.streams.update(zip(episodes.tolist(), generators, strict=True))
 
     def release(self, request: Any) -> Measurement:
-        values = self.traffic.aggregates(request.traffic, request.times, self.task.n_columns)
+        values = self.traffic.aggregates(request.traffic, request.times, self.task.n_channels)
         for k, episode in enumerate(request.episodes.tolist()):
             values[k] += self.streams[episode].laplace(0.0, self.sigma / 2**0.5, values[k].shape)
         return self.measurement(request, values, self.sigma)
