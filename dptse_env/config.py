@@ -20,7 +20,7 @@ from dptse_env.estimators.settings import (
     tuned_with,
 )
 from dptse_env.measurement import Detectors, FusionSettings
-from dptse_env.model import ARZParameters, available_parameters, load_parameters
+from dptse_env.model import ARZParameters, load_parameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.release import (
     RELEASE_MODELS,
@@ -82,7 +82,7 @@ class EnvConfig:
             ``blend``, ``open_loop``, ``recurrent``, ``asm``, ``mixture``, a registered name,
             ``"package.module:Class"``, or a class.
         backend: ``compiled``, or ``reference``, which EKF, UKF, EnKF and MHE have.
-        parameters: ARZ parameters, or the name of a set.
+        parameters: ARZ parameters; a name stands for a shipped set.
         estimator_settings: Tuning of the estimator, or the name of a shipped set
             (`dptse_env.estimators.settings`), whichever estimator it was tuned for. None for the
             set ``<estimator>-<ARZ parameters>-<privacy preset>-<corridor>``, or that without the
@@ -119,7 +119,7 @@ class EnvConfig:
     corridor: Corridor = CORRIDORS["paper-highway"]
     estimator: Any = "ekf"
     backend: str = "compiled"
-    parameters: str | ARZParameters = "paper"
+    parameters: ARZParameters = field(default=load_parameters("paper"))
     estimator_settings: Any = None
     bandwidth: Annotated[int, Interval(1, 1000)] = 5
     query_spans: tuple[Annotated[int, Interval(1, 1000)], ...] = (1,)
@@ -201,12 +201,6 @@ class EnvConfig:
     def last_start(self) -> int:
         """Latest second of the record at which an episode may start."""
         return self.corridor.duration - self.horizon_steps
-
-    @property
-    def arz_parameters(self) -> ARZParameters:
-        """The ARZ parameters of the estimator's model."""
-        parameters = self.parameters
-        return load_parameters(parameters) if isinstance(parameters, str) else parameters
 
     @property
     def settings_name(self) -> str | None:
@@ -330,24 +324,20 @@ def _backend(path: str, value: Any, base: Any, estimator: Any) -> str:
     return str(_typed(path, value, base))
 
 
-def _parameters(path: str, value: Any, base: Any) -> str | ARZParameters:
-    """Return ARZ parameters: the name of a set, a mapping of them all, or a JSON file."""
-    if isinstance(value, str) and value.endswith(".json"):
-        return read_parameters(value)
-    found: str | ARZParameters = _typed(path, value, base)
-    if isinstance(found, str):
-        require_name(path, found, available_parameters())
-    return found
+def _parameters(path: str, value: Any, _base: Any) -> ARZParameters:
+    """Return ARZ parameters: by name, an object, a mapping of all of them, or a JSON file."""
+    if isinstance(value, str):
+        return (read_parameters if value.endswith(".json") else load_parameters)(value)
+    return from_mapping(ARZParameters, value, path)
 
 
 def _tuned(
-    estimator: Any, parameters: str | ARZParameters, privacy: PrivacySettings, corridor: Corridor
+    estimator: Any, parameters: ARZParameters, privacy: PrivacySettings, corridor: Corridor
 ) -> str | None:
     """Return the name of the shipped settings that hold where none are given, if any ship."""
     # A road of one's own takes no variant that happens to have its name.
     road = corridor.name if corridor.name in CORRIDORS else ""
-    arz = load_parameters(parameters) if isinstance(parameters, str) else parameters
-    return tuned_settings(estimator, arz, privacy.preset, road)
+    return tuned_settings(estimator, parameters, privacy.preset, road)
 
 
 def _settings(
@@ -617,7 +607,7 @@ def _inherited(
     config: EnvConfig, given: Mapping[str, Any], assumed: tuple[str, ...]
 ) -> tuple[str, ...]:
     """Return the keywords whose values are of another road or parameter set, or assumed."""
-    corridor, parameters = config.corridor, config.arz_parameters
+    corridor, parameters = config.corridor, config.parameters
     is_other_road = not any(corridor.has_geometry_of(each.corridor) for each in PRESETS.values())
     found = []
     if is_other_road:
@@ -625,7 +615,7 @@ def _inherited(
         fields = given.get("corridor")
         if isinstance(fields, Mapping) and "average_dwell" not in fields:
             found.append("corridor.average_dwell")
-        if isinstance(config.parameters, str) and "parameters" not in given:
+        if "parameters" not in given:
             found.append("parameters")
     is_other = is_other_road or parameters != load_parameters(tuned_with(parameters))
     if is_other and config.settings_name is not None and "estimator_settings" not in given:

@@ -124,7 +124,7 @@ def make_model(config: EnvConfig) -> ARZModel:
     task = make_task(config)
     return ARZModel(
         config.corridor.road,
-        config.arz_parameters,
+        config.parameters,
         TIME_STEP,
         reference_speed=task.flow_centre,
         channels=task.channels.head(task.n_on_road),

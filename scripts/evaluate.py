@@ -282,7 +282,7 @@ def draw_traffic(args: Args, title: str, scores: Scores, cells: Sequence[Cell]) 
 def make_title(cell: Cell, seeds: Sequence[int]) -> str:
     """Return what is evaluated, in words, given one of the cells."""
     config = make_config(cell.env, cell.keywords)
-    model = f"parameters {config.arz_parameters.name}, release model {config.privacy.preset}"
+    model = f"parameters {config.parameters.name}, release model {config.privacy.preset}"
     epsilon, delta = config.privacy.epsilon, config.privacy.delta
     privacy = f"epsilon {rounded_up(epsilon)}, delta {rounded_up(delta)}"
     traffic = f"{len(seeds)} episode{'s' * (len(seeds) > 1)} on {seed_kind(seeds)} traffic"

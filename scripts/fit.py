@@ -276,10 +276,10 @@ def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:
             {**road.keywords, **keywords, "corridor": str(choice.stages / PLAYED)},
         )
     said = {
-        "parameters": f"the parameters {config.arz_parameters.name} were fitted to another road",
+        "parameters": f"the parameters {config.parameters.name} were fitted to another road",
         "estimator_settings": (
             f"the settings {config.settings_name} were tuned on another road with "
-            f"{tuned_with(config.arz_parameters)}: dptse tune makes settings of your own"
+            f"{tuned_with(config.parameters)}: dptse tune makes settings of your own"
         ),
     }
     return [said.get(key, f"{key} is of another road") for key in config.inherited]

@@ -190,7 +190,7 @@ def test_files_of_a_road_hold_for_the_estimator_that_they_were_tuned_for(tmp_pat
         warnings.simplefilter("error")  # a complete file warns of nothing
         whole = config()
     assert whole.inherited == ()
-    assert whole.arz_parameters == arz
+    assert whole.parameters == arz
     assert (whole.settings().count_noise, whole.settings().demand is None) == (0.1, False)
     with pytest.warns(UserWarning, match="^estimator_settings: values measured or tuned on"):
         assert config(estimator="random_walk").settings_name == "random_walk-w99-3lane-paced"

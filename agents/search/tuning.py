@@ -107,7 +107,7 @@ class Search:
     def name(self) -> str:
         """Name of the set, which names its files: of a class with a dot in place of the colon."""
         config = self.config
-        parameters, preset = config.arz_parameters.name, str(config.privacy.preset)
+        parameters, preset = config.parameters.name, str(config.privacy.preset)
         name = settings_name(self.estimator, parameters, preset, self.variant)
         return name.replace(":", ".")  # Windows has no files with a colon
 
@@ -162,7 +162,7 @@ class Search:
         return {
             **json.loads(self.cell().id),
             "corridor": config.corridor.digest,
-            "parameters": dataclasses.asdict(config.arz_parameters),
+            "parameters": dataclasses.asdict(config.parameters),
             "seeds": self.seeds,
             "seed": self.seed,
             "dptse-env": code_version(),
@@ -254,7 +254,7 @@ def write(search: Search, study: optuna.Study, path: Path) -> dict[str, Any]:
         write_settings(
             temporary,
             estimator=search.estimator,
-            parameters=config.arz_parameters.name,
+            parameters=config.parameters.name,
             privacy=str(config.privacy.preset),
             settings=settings,
             provenance=provenance,

@@ -65,7 +65,7 @@ def default(field: dataclasses.Field[Any]) -> str:
     if value is dataclasses.MISSING:
         return "—" if field.default_factory is dataclasses.MISSING else "see below"
     if dataclasses.is_dataclass(value):
-        return "see below"
+        return f'`"{value.name}"`' if hasattr(value, "name") else "see below"
     if isinstance(value, tuple) and len(value) > 8 and value == tuple(range(len(value))):
         return f'`"0:{len(value)}"`'
     return f"`{json.dumps(value) if isinstance(value, str | tuple) else repr(value)}`"

@@ -80,7 +80,7 @@ def test_the_environment_has_the_set_of_the_file_by_its_name(fitted):
         warnings.simplefilter("always")
         env = gym.make(ID, corridor=str(path), traffic_seeds=[0], parameters=set_of(path))
     config = env.unwrapped.config
-    assert (config.arz_parameters.name, config.bandwidth) == ("my-road", 1)
+    assert (config.parameters.name, config.bandwidth) == ("my-road", 1)
     # Its settings are those of the set that it comes from, and that is said.
     assert config.settings_name == f"{found['estimator']}-w99-3lane-paced"
     assert list(config.inherited) == ["estimator_settings"]

@@ -168,7 +168,7 @@ def test_the_keywords_of_a_file_come_after_the_callers(road):
     with pytest.warns(UserWarning, match=r"corridor\.average_dwell"):
         config = resolve("private-highway", {"corridor": str(road)})
     assert config.bandwidth == 3
-    assert config.parameters == "w99-3lane"
+    assert config.parameters.name == "w99-3lane"
     assert "parameters" not in config.inherited
     assert "corridor.average_dwell" in config.inherited
     with pytest.warns(UserWarning, match=r"corridor\.average_dwell"):
