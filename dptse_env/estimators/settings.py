@@ -23,6 +23,7 @@ from dptse_env.utils.fields import (
     from_mapping,
     read_json,
     shown,
+    within,
 )
 
 Linearisation = Literal["paper", "trajectory"]
@@ -374,7 +375,5 @@ def _entry(content: Any, path: str) -> dict[str, Any]:
 
 
 def _parse(entry: Mapping[str, Any], path: str) -> EstimatorSettings:
-    try:
+    with within(f"{path}: "):
         return from_mapping(EstimatorSettings, entry["settings"], _PATH)
-    except ValueError as problem:
-        raise ValueError(f"{path}: {problem}") from problem

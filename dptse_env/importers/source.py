@@ -17,6 +17,7 @@ from dptse_env.utils.fields import (
     read_toml,
     require,
     require_name,
+    within,
 )
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "frame": 0.0}
@@ -152,7 +153,5 @@ def read_source(path: str | os.PathLike[str]) -> Source:
             message starts with the file's path.
     """
     content = read_toml(path, "mapping")
-    try:
+    with within(f"{path}: "):
         return from_mapping(Source, content, "source")
-    except ValueError as problem:
-        raise ValueError(f"{path}: {problem}") from problem

@@ -19,6 +19,7 @@ from dptse_env.utils.fields import (
     read_json,
     require_name,
     shipped_texts,
+    within,
 )
 
 SECONDS_PER_HOUR = 3600.0
@@ -76,11 +77,6 @@ class ARZParameters:
         checked_fields(self, "parameters")
         if self.derived_from is not None:
             require_name("parameters.derived_from", self.derived_from, available_parameters())
-
-    @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any]) -> ARZParameters:
-        """Return the parameters in a mapping; unknown and missing keys are refused."""
-        return from_mapping(cls, mapping, "parameters")
 
     def largest_time_step(self, segment_length: float) -> float:
         """Return the largest time step T [s] of the CFL condition for segments of a length [km].
@@ -171,7 +167,5 @@ def write_parameters(
 
 def _parse(content: Any, path: str) -> ARZParameters:
     checked = check_object(content, path, {"parameters": dict, "provenance": dict})
-    try:
-        return ARZParameters.from_mapping(checked["parameters"])
-    except ValueError as problem:
-        raise ValueError(f"{path}: {problem}") from problem
+    with within(f"{path}: "):
+        return from_mapping(ARZParameters, checked["parameters"], "parameters")

@@ -23,7 +23,7 @@ import tomli_w
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, IncidentDistribution
-from dptse_env.utils.fields import from_mapping, read_toml, shown
+from dptse_env.utils.fields import from_mapping, read_toml, require, within
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.registry import Registry, require_registered
 
@@ -175,22 +175,19 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
     """
     path = Path(path)
     content = read_toml(path, "road file")
-    environment = content.pop(_ENVIRONMENT, {})
-    if not isinstance(environment, Mapping):
-        raise ValueError(f"{path}: {_ENVIRONMENT} must be a table, got {shown(environment)}")
-    if "corridor" in environment:
-        raise ValueError(f"{path}: {_ENVIRONMENT}.corridor must be left out: this file is one")
-    try:
+    with within(f"{path}: "):
+        environment = content.pop(_ENVIRONMENT, {})
+        require(isinstance(environment, Mapping), _ENVIRONMENT, "a table", environment)
+        own = environment.get("corridor")
+        require(own is None, f"{_ENVIRONMENT}.corridor", "left out: this file is one", own)
         corridor, assumed = _corridor(content, path)
-    except ValueError as problem:
-        raise ValueError(f"{path}: {problem}") from problem
-    try:
-        for key in PARTS:
-            require_registered(environment.get(key), f"{path}: {_ENVIRONMENT}.{key}")
-        home = path.resolve().parent
-        keywords = {key: _absolute(value, home) for key, value in environment.items()}
-    except RecursionError as problem:
-        raise ValueError(f"{path}: {_ENVIRONMENT} must not be nested so deeply") from problem
+        try:
+            for key in PARTS:
+                require_registered(environment.get(key), f"{_ENVIRONMENT}.{key}")
+            home = path.resolve().parent
+            keywords = {key: _absolute(value, home) for key, value in environment.items()}
+        except RecursionError as problem:
+            raise ValueError(f"{_ENVIRONMENT} must not be nested so deeply") from problem
     return RoadFile(corridor, keywords, assumed)
 
 

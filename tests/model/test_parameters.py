@@ -12,6 +12,7 @@ from dptse_env.model.parameters import (
     read_parameters,
     write_parameters,
 )
+from dptse_env.utils.fields import from_mapping
 from tests.helpers import UNEVEN
 
 from .oracle import HIGHWAY, PAPER
@@ -46,7 +47,7 @@ def test_named_sets_hold_their_published_values():
 )
 def test_bad_value_is_named(field, value, message):
     with pytest.raises(ValueError, match=rf"^parameters\.{message}"):
-        ARZParameters.from_mapping({**GOOD, field: value})
+        from_mapping(ARZParameters, {**GOOD, field: value}, "parameters")
 
 
 def test_written_set_reads_back_with_its_provenance(tmp_path):

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 from dptse_env.importers.sumo_net.net import root_of
 from dptse_env.traffic.own_sumo import TRAFFIC, UNREADABLE, clock, copy_input, open_xml
-from dptse_env.utils.fields import shown
+from dptse_env.utils.fields import shown, within
 
 SHORT = {
     "n": "net-file", "net": "net-file",
@@ -71,11 +71,11 @@ class Files:
             root = root_of(path, where)
             if where != "net" and root.tag in ("net", "configuration", "sumoConfiguration"):
                 raise ValueError(f"{where}: {path} must hold {where}, got <{root.tag}>")
-            try:
-                with tempfile.TemporaryDirectory(prefix="dptse-import-") as folder:
-                    copied = copy_input(path, Path(folder) / "copy.xml", begin)
-            except ValueError as error:
-                raise ValueError(f"{where}: {error}") from error
+            with (
+                within(f"{where}: "),
+                tempfile.TemporaryDirectory(prefix="dptse-import-") as folder,
+            ):
+                copied = copy_input(path, Path(folder) / "copy.xml", begin)
             if where == "routes" and not copied.n_elements:
                 raise ValueError(f"routes: {path} must have vehicles, got an empty file")
             if not copied.is_sorted:
