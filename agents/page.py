@@ -53,7 +53,7 @@ class Watched:
 
     def __call__(self) -> None:
         """Add the present second."""
-        process, n = self._process, self._process.interface.n_mainline
+        process, n = self._process, self._process.interface.queries.n_mainline
         self.history.append(process)
         self.density_std.append(process.estimate.density_std[0, :n].copy())
         self.epsilon.append(float(process.info(0)["spent_epsilon"]))

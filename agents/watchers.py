@@ -46,7 +46,7 @@ class Contributions:
         self._process, self._ledgers = process, process.release.ledgers
         self._is_cleared = isinstance(process.release, Paced) and task.settings.unit == "event"
         self._covers = task.covers[task.channels.group == 0]
-        shape = (process.n_episodes, process.interface.n_mainline)
+        shape = (process.n_episodes, process.interface.queries.n_mainline)
         self._met, self._refused = np.zeros((2, *shape), dtype=np.int64)
         self._before: AnyArray | None = None
 
@@ -136,7 +136,7 @@ class Honesty:
         process = self._process
         if process.elapsed[0] <= WARM_UP:
             return
-        n, estimate = process.interface.n_mainline, process.estimate
+        n, estimate = process.interface.queries.n_mainline, process.estimate
         truth = process.truth(np.arange(process.n_episodes))[:, :n]
         occupied = truth[..., 0] > 0.0
         means = np.stack([estimate.density, estimate.speed], -1)[:, :n]

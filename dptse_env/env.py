@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.env_base import QueryEnvBase
-from dptse_env.rendering import Drawing, Window
+from dptse_env.rendering import Drawing, Screen
 from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Observation
 from dptse_env.utils.fields import integer
@@ -214,8 +214,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
         self.render_every = integer("render_every", render_every, 1)
         if render_mode is not None:
             is_shown = render_mode == "human"
-            window = Window("dptse-env", self.metadata["render_fps"]) if is_shown else None
-            self.drawing = Drawing(every=self.render_every, window=window)
+            screen = Screen("dptse-env", self.metadata["render_fps"]) if is_shown else None
+            self.drawing = Drawing(every=self.render_every, screen=screen)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -278,5 +278,5 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self.drawing is not None and self.drawing.window is not None:
-            self.drawing.window.close()
+        if self.drawing is not None and self.drawing.screen is not None:
+            self.drawing.screen.close()

@@ -6,6 +6,8 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from dptse_env.config import TIME_STEP, EnvConfig
 from dptse_env.estimators import Estimator, make_estimator
 from dptse_env.measurement import (
@@ -30,6 +32,7 @@ from dptse_env.spaces.actions import ACTION_ENCODINGS, ActionEncoding
 from dptse_env.spaces.observations import ObservationEncoding
 from dptse_env.spaces.rewards import make_reward
 from dptse_env.traffic import RecordLibrary
+from dptse_env.utils.arrays import BoolArray, Observation
 from dptse_env.utils.registry import name_of_class
 
 
@@ -50,15 +53,15 @@ class QueryInterface:
     observations: ObservationEncoding
     reward: Any
 
-    @property
-    def n_mainline(self) -> int:
-        """Number of mainline segments."""
-        return self.queries.n_mainline
+    def picked(self, observation: Observation) -> BoolArray:
+        """Return the options picked so far for the next query, shape (..., G).
 
-    @property
-    def bandwidth(self) -> int:
-        """Largest cost of a step's queries together."""
-        return self.queries.bandwidth
+        Args:
+            observation: Shape (..., size); without a block ``picked`` there are none.
+        """
+        if "picked" not in self.observations.slices:
+            return np.zeros((*observation.shape[:-1], self.queries.n_options), dtype=bool)
+        return self.observations.block(observation, "picked") > 0
 
     def require_sequential(self) -> None:
         """Raise ``ValueError`` unless an action picks one option, as for ``"sequential"``."""

@@ -63,7 +63,7 @@ class QueryProcess:
         fusion: Turns releases into measurements of all vehicles; None where they are these.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
-        start: Second that it began at, shape (n,).
+        start: Second that it began at, below 0 before its first reset, shape (n,).
         traffic_index: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
         queried: The options of each episode's last query, shape (n, G).
         age: Steps since each mainline segment was last observed, shape (n, n_mainline).
@@ -146,10 +146,10 @@ class QueryProcess:
         """
         if self._is_fork:
             raise RuntimeError("a fork cannot be reset: reset the process that it was made from")
-        choice = ResetOptions.from_mapping(options, self.config, len(episodes))
+        fixed = checked_options(options, self.config, len(episodes))
         streams = [list(map(np.random.default_rng, _seed_of(each).spawn(4))) for each in generators]
         for_traffic, for_noise, for_estimator, for_detectors = zip(*streams, strict=True)
-        traffic, starts = choice.draw(for_traffic)
+        traffic, starts = draw_traffic(fixed, self.config, for_traffic)
         for index in self.traffic.load(traffic):
             self.boundary.load(index)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
@@ -202,6 +202,11 @@ class QueryProcess:
     def elapsed(self) -> IntArray:
         """Seconds since each episode began, shape (n,)."""
         return self.time - self.start
+
+    @property
+    def was_reset(self) -> BoolArray:
+        """Flags of episodes that were ever begun, shape (n,)."""
+        return self.start >= 0
 
     @property
     def over(self) -> BoolArray:
@@ -362,65 +367,51 @@ def _seed_of(generator: np.random.Generator) -> np.random.SeedSequence:
 RESET_OPTIONS = ("traffic_seed", "start")
 
 
-@dataclass(frozen=True)
-class ResetOptions:
-    """Checked reset options of k episodes; None where an episode draws a random value.
+def checked_options(
+    options: Mapping[str, Any] | None, config: EnvConfig, n_episodes: int
+) -> list[tuple[int | None, int | None]]:
+    """Return the traffic seed and first second that ``options`` fix in each of k episodes.
 
-    Attributes:
-        config: The configuration of the environment.
-        traffic: Indices into ``config.traffic_seeds``, k of them.
-        starts: First seconds of the record, k of them.
+    Each option is one value for all episodes, or one for each; None fixes nothing.
+
+    Raises:
+        ValueError: A key is unknown, a value out of range, or there are too many or too few.
     """
+    options = options or {}
+    for key in options:
+        if key not in RESET_OPTIONS:
+            raise ValueError(f"options.{key} is unknown; allowed: {', '.join(RESET_OPTIONS)}")
+    seeds, starts = (per_episode(key, options.get(key), n_episodes) for key in RESET_OPTIONS)
+    known, last = config.traffic_seeds, config.last_start
+    for seed in seeds:
+        if seed is not None and (type(seed) is not int or seed not in known):
+            raise ValueError(
+                f"options.traffic_seed must be one of the environment's "
+                f"{len(known)} traffic_seeds, got {shown(seed)}"
+            )
+    for start in starts:
+        if start is not None and (type(start) is not int or not 0 <= start <= last):
+            raise ValueError(f"options.start must be an integer in 0..{last}, got {shown(start)}")
+    return list(zip(seeds, starts, strict=True))
 
-    config: EnvConfig
-    traffic: list[int | None]
-    starts: list[int | None]
 
-    @classmethod
-    def from_mapping(
-        cls, options: Mapping[str, Any] | None, config: EnvConfig, n_episodes: int = 1
-    ) -> ResetOptions:
-        """Check ``options``: each one value for all episodes, or one for each.
+def draw_traffic(
+    fixed: Sequence[tuple[int | None, int | None]],
+    config: EnvConfig,
+    generators: Sequence[np.random.Generator],
+) -> tuple[IntArray, IntArray]:
+    """Return traffic indices and first seconds of k episodes, drawn where they are not fixed.
 
-        Raises:
-            ValueError: A key is unknown, a value out of range, or there are too many or too few.
-        """
-        options = options or {}
-        for key in options:
-            if key not in RESET_OPTIONS:
-                raise ValueError(f"options.{key} is unknown; allowed: {', '.join(RESET_OPTIONS)}")
-        seeds, starts = (per_episode(key, options.get(key), n_episodes) for key in RESET_OPTIONS)
-        known, last = config.traffic_seeds, config.last_start
-        for seed in seeds:
-            if seed is not None and (type(seed) is not int or seed not in known):
-                raise ValueError(
-                    f"options.traffic_seed must be one of the environment's "
-                    f"{len(known)} traffic_seeds, got {shown(seed)}"
-                )
-        for start in starts:
-            if start is not None and (type(start) is not int or not 0 <= start <= last):
-                raise ValueError(
-                    f"options.start must be an integer in 0..{last}, got {shown(start)}"
-                )
-        traffic = [None if seed is None else known.index(seed) for seed in seeds]
-        return cls(config, traffic, starts)
-
-    def draw(self, generators: Sequence[np.random.Generator]) -> tuple[IntArray, IntArray]:
-        """Return traffic indices and first seconds of the episodes, drawn where they are not fixed.
-
-        Both are always drawn, so that fixing one does not change the other.
-        """
-        traffic = np.empty(len(generators), dtype=np.int64)
-        starts = np.empty(len(generators), dtype=np.int64)
-        for k, generator in enumerate(generators):
-            index = int(generator.integers(len(self.config.traffic_seeds)))
-            start = int(generator.integers(self.config.last_start + 1))
-            fixed_index, fixed_start = self.traffic[k], self.starts[k]
-            traffic[k] = index if fixed_index is None else fixed_index
-            if fixed_start is None:
-                fixed_start = start if self.config.random_start else 0
-            starts[k] = fixed_start
-        return traffic, starts
+    Both are always drawn, so that fixing one does not change the other.
+    """
+    traffic = np.empty(len(fixed), dtype=np.int64)
+    starts = np.empty(len(fixed), dtype=np.int64)
+    for k, ((seed, start), generator) in enumerate(zip(fixed, generators, strict=True)):
+        index = int(generator.integers(len(config.traffic_seeds)))
+        drawn = int(generator.integers(config.last_start + 1))
+        traffic[k] = index if seed is None else config.traffic_seeds.index(seed)
+        starts[k] = start if start is not None else drawn if config.random_start else 0
+    return traffic, starts
 
 
 def per_episode(name: str, value: Any, n_episodes: int) -> list[Any]:

@@ -90,7 +90,7 @@ class History:
 
     def append(self, process: QueryProcess) -> None:
         """Add the present second, or replace it where a decision took several actions."""
-        n, e = process.interface.n_mainline, self.episode
+        n, e = process.interface.queries.n_mainline, self.episode
         second, rows = int(process.elapsed[e]), np.array([e])
         self.truth[second:] = [process.truth(rows)[0, :n, 0]]
         self.estimate[second:] = [process.estimate.density[e, :n].copy()]
@@ -217,15 +217,15 @@ class Drawing:
         history: The episode so far; None before the first one begins.
     """
 
-    def __init__(self, episode: int = 0, every: int = 1, window: Window | None = None) -> None:
+    def __init__(self, episode: int = 0, every: int = 1, screen: Screen | None = None) -> None:
         """Draw an episode of a process.
 
         Args:
             episode: Its number.
             every: Seconds between two drawings; in between, `draw` returns the last one.
-            window: Shows every second; None for none.
+            screen: Shows every second; None for none.
         """
-        self.episode, self.every, self.window = episode, every, window
+        self.episode, self.every, self.screen = episode, every, screen
         self.history: History | None = None
         self._picture: Picture | None = None
         self._frame: tuple[int, NDArray[np.uint8]] | None = None
@@ -233,16 +233,16 @@ class Drawing:
     def begin(self, process: QueryProcess) -> None:
         """Take up an episode that was just reset."""
         self.history, self._frame = History.from_process(process, self.episode), None
-        if self.window is not None:
-            self.window.reopen()
-            self.window.show(self.draw())
+        if self.screen is not None:
+            self.screen.reopen()
+            self.screen.show(self.draw())
 
     def follow(self, process: QueryProcess) -> None:
         """Add the second that the episode stands at."""
         assert self.history is not None
         self.history.append(process)
-        if self.window is not None:
-            self.window.show(self.draw())
+        if self.screen is not None:
+            self.screen.show(self.draw())
 
     def draw(self) -> NDArray[np.uint8]:
         """Return the picture, shape (height, width, 3), drawn anew if it is due.
@@ -263,7 +263,7 @@ class Drawing:
         return self._frame[1].copy()
 
 
-class Window:
+class Screen:
     """A window for pictures of one size, by pygame.
 
     Closing it by hand ends the showing and nothing else: the episode goes on.

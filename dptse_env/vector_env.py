@@ -129,7 +129,6 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._generators: list[tuple[np.random.Generator, int] | None] = [None] * self.num_envs
-        self._was_reset = np.zeros(self.num_envs, dtype=bool)
         self._all = np.arange(self.num_envs)
         size = self.single_observation_space.shape
         self._observation = np.zeros((self.num_envs, *size), dtype=np.float32)
@@ -254,7 +253,6 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
     def _reset(self, episodes: IntArray, options: Mapping[str, Any] | None = None) -> None:
         generators = [self._generator(e)[0] for e in episodes]
         self._observation[episodes] = self.process.reset(episodes, generators, options).observation
-        self._was_reset[episodes] = True
         if self.drawing is not None and self.render_episode in episodes:
             self.drawing.begin(self.process)
 
@@ -299,10 +297,10 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         return mask
 
     def _require_reset(self) -> None:
-        if not self._was_reset.all():
+        n_idle = np.count_nonzero(~self.process.was_reset)
+        if n_idle > 0:
             raise gym.error.ResetNeeded(
-                f"{(~self._was_reset).sum()} of {self.num_envs} episodes were never reset: "
-                "call reset() first"
+                f"{n_idle} of {self.num_envs} episodes were never reset: call reset() first"
             )
 
     def _checked_over(self) -> BoolArray:

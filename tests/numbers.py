@@ -223,7 +223,7 @@ def releases(case: str) -> Numbers:
     process.measure = watched
     _, info = env.reset(seed=7)
     report = json.dumps(info["privacy"], sort_keys=True)
-    n_options, n_queries = process.interface.queries.n_options, process.interface.bandwidth
+    n_options, n_queries = process.interface.queries.n_options, process.interface.queries.bandwidth
     for _ in range(SECONDS):
         action = np.zeros(n_options, dtype=np.int8)
         action[rng.choice(n_options, min(2, n_queries), replace=False)] = 1

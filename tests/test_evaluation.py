@@ -48,7 +48,7 @@ class Learned:
 
     def __init__(self, env):
         self.interface = env.unwrapped.interface
-        shape = self.interface.observations.space.shape[0], self.interface.n_mainline
+        shape = self.interface.observations.space.shape[0], self.interface.queries.n_mainline
         self.weights = np.random.default_rng(0).standard_normal(shape)
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
@@ -61,7 +61,7 @@ class Learned:
             picked = interface.observations.block(batch, "picked") > 0
         scores = np.where(picked, -np.inf, state if deterministic else -state)
         wanted = np.zeros(state.shape, dtype=bool)
-        best = np.argsort(-scores, axis=1)[:, : interface.bandwidth]
+        best = np.argsort(-scores, axis=1)[:, : interface.queries.bandwidth]
         np.put_along_axis(wanted, best, True, axis=1)
         action = interface.actions.encode(wanted, np.zeros_like(wanted))
         return (action[0] if np.ndim(observation) == 1 else action), state

@@ -7,7 +7,7 @@ import pytest
 
 from dptse_env.config import resolve
 from dptse_env.parts import make_parts
-from dptse_env.process import QueryProcess, ResetOptions
+from dptse_env.process import QueryProcess, draw_traffic
 from dptse_env.release.noise import grid_of
 from dptse_env.traffic import RecordLibrary
 from tests.helpers import SumRelease, assert_same, make_batch, make_env, play
@@ -117,12 +117,11 @@ def test_traffic_noise_estimator_and_detectors_have_streams_of_their_own(monkeyp
     def spied(reset):
         return lambda episodes, *rest: (given.append(rest[-1]), reset(episodes, *rest))[1]
 
-    def spied_draw(choice, generators):
+    def spied_draw(fixed, config, generators):
         given.append(generators)
-        return draw(choice, generators)
+        return draw_traffic(fixed, config, generators)
 
-    draw = ResetOptions.draw
-    monkeypatch.setattr(ResetOptions, "draw", spied_draw)
+    monkeypatch.setattr("dptse_env.process.draw_traffic", spied_draw)
     process = begin((0, 0), EVERYWHERE, detectors={"dropout": 0.1}, estimator="enkf")
     for part in (process.detectors, process.release, process.estimator):
         monkeypatch.setattr(part, "reset", spied(part.reset))

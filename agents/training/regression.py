@@ -46,7 +46,7 @@ def squared_errors(process: QueryProcess) -> Observation:
     Density and speed count together, in units of the corridor's scales. The speed of an empty
     segment does not count.
     """
-    corridor, n = process.config.corridor, process.interface.n_mainline
+    corridor, n = process.config.corridor, process.interface.queries.n_mainline
     truth, estimate = process.truth(np.arange(process.n_episodes))[:, :n], process.estimate
     density = (estimate.density[:, :n] - truth[..., 0]) / corridor.density_scale
     speed = (estimate.speed[:, :n] - truth[..., 1]) / corridor.speed_scale

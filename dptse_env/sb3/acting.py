@@ -144,8 +144,5 @@ class ActingPolicy:
 
     def _masks(self, observation: Observation) -> BoolArray:
         """Return the options that may be picked next, (G,) or (k, G)."""
-        actions, observations = self.interface.actions, self.interface.observations
-        picked = np.zeros((*observation.shape[:-1], actions.n_options), dtype=bool)
-        if "picked" in observations.slices:
-            picked = observations.block(observation, "picked") > 0
-        return actions.available(np.atleast_2d(picked)).reshape(picked.shape)
+        picked = self.interface.picked(observation)
+        return self.interface.actions.available(np.atleast_2d(picked)).reshape(picked.shape)

@@ -114,8 +114,8 @@ class Schedule(ABC):
         """Bind the schedule to an environment's interface (``env.unwrapped.interface``)."""
         self.interface = interface
         self.queries = interface.queries
-        self.n_mainline = interface.n_mainline
-        self.bandwidth = interface.bandwidth
+        self.n_mainline = self.queries.n_mainline
+        self.bandwidth = self.queries.bandwidth
         self.generator = np.random.default_rng(seed)
 
     @abstractmethod
@@ -146,7 +146,7 @@ class Schedule(ABC):
         batch = np.atleast_2d(observation)
         k = len(batch)
         step, wanted = self._resume(k, state, episode_start)
-        picked = self._picked(batch)
+        picked = self.interface.picked(batch)
         fresh = np.flatnonzero(~picked.any(axis=1))
         if fresh.size:
             wanted[fresh] = self._choose(fresh, step[fresh], batch[fresh])
@@ -171,11 +171,6 @@ class Schedule(ABC):
         if episode_start is not None:
             step[np.broadcast_to(episode_start, (k,)).astype(bool)] = 0
         return step, wanted
-
-    def _picked(self, batch: Observation) -> BoolArray:
-        if "picked" not in self.interface.observations.slices:
-            return np.zeros((len(batch), self.queries.n_options), dtype=bool)
-        return self.interface.observations.block(batch, "picked") > 0
 
     def block(self, observation: Observation, name: str) -> Observation:
         """Return a block of observations (k, size), shape (k, size of the block)."""

@@ -242,7 +242,7 @@ class SpeedFront(Schedule):
         for name in ("density_innovation", "speed_innovation"):
             squares += 0.5 * self.block(batch, name).astype(np.float64) ** 2
         # While the picks of a second are made one by one, the same measurements are seen again.
-        is_new = ~self._picked(batch).any(axis=1, keepdims=True)
+        is_new = ~self.interface.picked(batch).any(axis=1, keepdims=True)
         answered = np.where(is_new, self.block(batch, "queried") > 0.0, False).astype(np.float64)
         covers = self.queries.covers.astype(np.float64)
         times = answered @ covers

@@ -124,7 +124,7 @@ class Process:
     def __init__(self):
         self.elapsed = np.array([61, 61])
         self.estimate = None
-        self.interface = SimpleNamespace(n_mainline=1)
+        self.interface = SimpleNamespace(queries=SimpleNamespace(n_mainline=1))
 
     def play(self, errors, occupied=True):
         truth = np.zeros((2, 2, 2))

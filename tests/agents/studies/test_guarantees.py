@@ -87,7 +87,7 @@ def test_epsilon_is_that_of_the_sums_of_two_vehicles():
 def test_exact_releases_the_true_densities_of_what_is_queried_and_claims_nothing():
     keywords = {**paid(release="exact").keywords, "traffic_seeds": [2000], "truth_in_info": True}
     env = gym.make(SHORT, disable_env_checker=True, **keywords)
-    schedule, n = make_schedule("round-robin", env), env.unwrapped.interface.n_mainline
+    schedule, n = make_schedule("round-robin", env), env.unwrapped.interface.queries.n_mainline
     observation, _ = env.reset(seed=2000, options={"traffic_seed": 2000})
     state, largest = None, 0.0
     for _ in range(120):

@@ -438,7 +438,7 @@ def test_a_policy_that_sees_the_truth_would_show(action):
 
     def crowded(observation, state):
         density = process.truth(np.array([0]))[:, :15, 0]
-        wanted = density.argsort(axis=1).argsort(axis=1) >= 15 - interface.bandwidth
+        wanted = density.argsort(axis=1).argsort(axis=1) >= 15 - interface.queries.bandwidth
         return interface.actions.encode(wanted, process.pending.picked)[0], None
 
     assert unlike(env, Acting(crowded))
