@@ -60,11 +60,12 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | epsilon                  | 1    | log10 of the privacy parameter                 | [-6, 6]   |
     | picked                   | G    | whether it is picked for the step to come      | [0, 1]    |
     | last_price               | G    | log10(price of the last query) / 2, 0 before   | [-5, 5]   |
-    | tracer                   | n    | mean charge of a vehicle there [its budget]    | [0, 1]    |
+    | spent_share              | n    | mean charge of a vehicle there [its budget]    | [0, 1]    |
 
     Either ``released_speed`` or ``released_flow`` is there, whichever the release model releases,
-    ``picked`` under ``action="sequential"``, ``last_price`` and ``tracer`` under release models
-    with prices. Innovations are 0 where nothing was observed. ``observation`` chooses other blocks.
+    ``picked`` under ``action="sequential"``, ``last_price`` and ``spent_share`` under release
+    models with prices. Innovations are 0 where nothing was observed. ``observation`` chooses other
+    blocks.
 
     **Action**: ``action`` chooses the encoding; a sampled action never raises. B is the largest
     number of queries that the bandwidth pays for.
@@ -105,7 +106,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | ``spent_mu``        | privacy loss of a vehicle so far, at most: Gaussian DP parameter       |
     | ``spent_epsilon``   | the same as epsilon at the configured delta                            |
     | ``prices``          | under ``paced``: last price of each option, 0 before, shape (G,)       |
-    | ``tracer``          | under ``paced``: as in the observation, shape (n,)                     |
+    | ``spent_share``     | under ``paced``: as in the observation, shape (n,)                     |
     | ``centre_fallback`` | under ``paced``: 1 if no prediction was finite to centre flows on      |
     | ``truth``           | true traffic, with ``truth_in_info=True`` only                         |
     | ``privacy``         | at the reset only: the guarantee and its account, see `privacy`        |

@@ -304,7 +304,7 @@ class QueryProcess:
             queried=self.queried.take(episodes, 0),
             picked=self.pending.picked.take(episodes, 0),
             prices=public.get("prices"),
-            tracer=public.get("tracer"),
+            spent_share=public.get("spent_share"),
         )
         return self.interface.observations.encode(state)
 

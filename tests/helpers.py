@@ -361,29 +361,29 @@ class SumRelease(ReleaseModel):
 
 
 class PricedRelease(SumRelease):
-    """The same with a price of 0.01 times the level of a query, and a tracer that grows."""
+    """The same with a price of 0.01 for each query, and spent shares that grow."""
 
     has_prices = True
 
     def __init__(self, task, traffic):
         super().__init__(task, traffic)
         self.prices = np.zeros((task.n_episodes, task.queries.n_options))
-        self.tracer = np.zeros((task.n_episodes, task.corridor.n_mainline))
+        self.spent_share = np.zeros((task.n_episodes, task.corridor.n_mainline))
 
     def reset(self, episodes, generators):
         super().reset(episodes, generators)
-        self.prices[episodes], self.tracer[episodes] = 0.0, 0.0
+        self.prices[episodes], self.spent_share[episodes] = 0.0, 0.0
 
     def release(self, request):
         queries = self.task.queries
         asked = request.observed[:, : queries.n_options]
         before = self.prices[request.episodes]
         self.prices[request.episodes] = np.where(asked, 0.01, before)
-        self.tracer[request.episodes] += 0.25 * self.task.covered(request.observed)
+        self.spent_share[request.episodes] += 0.25 * self.task.covered(request.observed)
         return super().release(request)
 
     def public(self, episodes):
-        return {"prices": self.prices[episodes], "tracer": self.tracer[episodes]}
+        return {"prices": self.prices[episodes], "spent_share": self.spent_share[episodes]}
 
 
 class MeanRelease(SumRelease):

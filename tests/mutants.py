@@ -675,8 +675,8 @@ MUTANTS = (
         "measurement/test_boundary.py",
     ),
     Mutant(
-        "the tracer outlasts a reset", 23, "release/pacing.py",
-        "self._paces.tracer[episodes] = 0.0", "self._tracer = self._tracer.copy()",
+        "what is spent outlasts a reset", 23, "release/pacing.py",
+        "self._paces.spent[episodes] = 0.0", "self._paces.spent[:0] = 0.0",
         "release/test_pacing.py release/test_paced.py",
     ),
     Mutant(

@@ -65,7 +65,7 @@ def test_its_keys_of_info_are_those_of_episodes(privacy):
     env = gym.make(SHORT, privacy=privacy, traffic_seeds=[0], truth_in_info=True, epsilon=5)
     keys = [row[0] for row in table("key")]
     if privacy == "paper":
-        keys = [key for key in keys if key not in ("prices", "tracer", "centre_fallback")]
+        keys = [key for key in keys if key not in ("prices", "spent_share", "centre_fallback")]
     at_reset = env.reset(seed=0)[1]
     assert {*at_reset} == {*keys}
     assert {*env.step(np.zeros(6, np.int8))[4]} == {*keys} - {"privacy", "inherited"}

@@ -130,31 +130,31 @@ def test_queries_bring_the_estimate_nearer(estimator, spans):
     assert error(bandwidth=5, **sums) < 0.75 * error(bandwidth=1, **sums)
 
 
-def test_blocks_have_the_size_of_options_and_show_prices_and_the_tracer():
+def test_blocks_have_the_size_of_options_and_show_prices_and_the_spent_share():
     process = make_process(query_spans=(2, 3))
     encoding, n_options = process.interface.observations, 9
     assert process.interface.actions.space == gym.spaces.MultiBinary(n_options)
     sizes = {name: place.stop - place.start for name, place in encoding.slices.items()}
     of_options = ("released_density", "released_flow", "density_innovation", "queried")
     assert {sizes[name] for name in (*of_options, "speed_innovation", "last_price")} == {n_options}
-    assert {sizes[name] for name in ("age", "tracer")} == {6}
+    assert {sizes[name] for name in ("age", "spent_share")} == {6}
     first = process.observe(ONE)
     assert not encoding.block(first, "last_price").any()
-    assert not encoding.block(first, "tracer").any()
+    assert not encoding.block(first, "spent_share").any()
     query(process, 1)
     observation = query(process, 6)
     prices = encoding.block(observation, "last_price")[0]
     assert np.flatnonzero(prices).tolist() == [1, 6]
     np.testing.assert_allclose(prices[[1, 6]], 0.5 * np.log10(0.01), rtol=1e-6)
     np.testing.assert_allclose(
-        encoding.block(observation, "tracer")[0], [0, 0.5, 0.5, 0.25, 0, 0.5]
+        encoding.block(observation, "spent_share")[0], [0, 0.5, 0.5, 0.25, 0, 0.5]
     )
 
 
 def test_blocks_of_prices_are_there_where_queries_have_prices_or_they_are_asked_for():
     slices = make_process(privacy=SumRelease).interface.observations.slices
-    assert not {"last_price", "tracer"} & set(slices)
-    process = make_process(privacy="capped", observation=["age", "last_price", "tracer"])
+    assert not {"last_price", "spent_share"} & set(slices)
+    process = make_process(privacy="capped", observation=["age", "last_price", "spent_share"])
     assert not process.observe(ONE)[0, 6:].any()
 
 

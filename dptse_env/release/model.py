@@ -135,8 +135,8 @@ class ReleaseModel(ABC):
     def public(self, episodes: IntArray) -> Infos:
         """Return further public numbers for ``info``, rows of k episodes; by default none.
 
-        Where queries have prices, ``prices`` (k, G) and ``tracer`` (k, n_mainline) are among them,
-        as `dptse_env.spaces.observations.PublicState` describes them.
+        Where queries have prices, ``prices`` (k, G) and ``spent_share`` (k, n_mainline) are among
+        them, as `dptse_env.spaces.observations.PublicState` describes them.
         """
         return {}
 

@@ -252,14 +252,14 @@ class Paced(ReleaseModel):
         )
 
     def public(self, episodes: IntArray) -> Infos:
-        """Return prices and tracer of the queries, and whether no prediction was finite.
+        """Return prices and spent shares of the queries, and whether no prediction was finite.
 
-        Prices (k, G) are those of the last second, 0 at first; the tracer is of shape
+        Prices (k, G) are those of the last second, 0 at first; spent shares are of shape
         (k, n_mainline); then ``centre_fallback`` is 1.
         """
         return {
             "prices": self.prices.take(episodes, 0)[:, : self.task.queries.n_options],
-            "tracer": self.pacing.tracer(episodes),
+            "spent_share": self.pacing.spent_share(episodes),
             "centre_fallback": self._fallback[episodes],
         }
 

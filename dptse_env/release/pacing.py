@@ -71,7 +71,7 @@ class Pacing(ABC):
         """Return a typical price of each group (groups,) at predicted speeds [km/h] (S,)."""
         return self.budget
 
-    def tracer(self, episodes: IntArray) -> FloatArray:
+    def spent_share(self, episodes: IntArray) -> FloatArray:
         """Return the part of the budget for queries that vehicles on a segment may have spent.
 
         Shape (k, n_mainline), in [0, 1].
@@ -86,14 +86,14 @@ class Paces(NamedTuple):
     least: FloatArray  # (groups,) least that is offered for the rest of a trip
     charge: float  # expected payment over the price
     rates: FloatArray  # (n, groups, cells) of querying
-    tracer: FloatArray  # (n, groups, cells) expected payments so far
+    spent: FloatArray  # (n, groups, cells) expected payments so far
 
 
 class TripPacing(Pacing):
     """Prices for the unit ``trip``: they spend what is left of a budget evenly over its rest.
 
-    A tracer m follows the mean ledger of the vehicles on each segment: a query adds its expected
-    charge, ``a (1 + 0.15 r)``, predicted flows carry it along, and vehicles enter with 0. The rest
+    The mean m that vehicles on a segment have spent is predicted: a query adds its expected charge,
+    ``a (1 + 0.15 r)``, predicted flows carry it along, and vehicles enter with 0. The rest
     of a trip has R queried seconds: the sum, over the segments from here on, of the rate of
     querying times the length over the predicted speed, which is held to [8, 102] km/h, and a margin
     of 2 s. The price on a segment is ``max(pace b - m, 0.01 b) / R``, and that of a query the mean
@@ -115,14 +115,14 @@ class TripPacing(Pacing):
             least=LEAST_SHARE * budget,
             charge=1.0 + MEAN_SQUARE * task.settings.ratio,
             rates=np.tile(self._first_rates, (task.n_episodes, 1, 1)),
-            tracer=np.zeros((task.n_episodes, *self._first_rates.shape)),
+            spent=np.zeros((task.n_episodes, *self._first_rates.shape)),
         )
         self._bundle = Bundle(task.corridor.road, task.channels, self._paces)
 
     def reset(self, episodes: IntArray) -> None:
         """See `Pacing.reset`."""
         self._paces.rates[episodes] = self._first_rates
-        self._paces.tracer[episodes] = 0.0
+        self._paces.spent[episodes] = 0.0
 
     def prices(
         self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
@@ -141,10 +141,10 @@ class TripPacing(Pacing):
         prices: FloatArray = self._paces.offered / queried
         return prices
 
-    def tracer(self, episodes: IntArray) -> FloatArray:
-        """See `Pacing.tracer`."""
-        tracer = self._paces.tracer.take(episodes, 0)[:, 0, : self.task.corridor.n_mainline]
-        part: FloatArray = np.minimum(tracer / self.budget[0], 1.0)
+    def spent_share(self, episodes: IntArray) -> FloatArray:
+        """See `Pacing.spent_share`."""
+        spent = self._paces.spent.take(episodes, 0)[:, 0, : self.task.corridor.n_mainline]
+        part: FloatArray = np.minimum(spent / self.budget[0], 1.0)
         return part
 
 
@@ -190,10 +190,10 @@ def _pace(
     speed: FloatArray,
     prices: FloatArray,
 ) -> None:
-    """Move the tracers along, set prices, and charge the tracers for the queries.
+    """Carry what is spent along, set prices, and add what the queries cost.
 
     Args:
-        bundle: `Road`, `Channels` and `Paces`, whose rates and tracers are updated.
+        bundle: `Road`, `Channels` and `Paces`, whose rates and payments are updated.
         episodes: Shape (k,).
         observed: Channels that are observed, shape (k, C).
         density: Predicted densities [veh/km], shape (k, S).
@@ -202,13 +202,13 @@ def _pace(
     """
     road, channels, paces = bundle.parts
     offered, least, charge = paces.offered, paces.least, paces.charge
-    rates, tracer = paces.rates, paces.tracer
-    n_groups, n_cells = tracer.shape[1], tracer.shape[2]
+    rates, spent = paces.rates, paces.spent
+    n_groups, n_cells = spent.shape[1], spent.shape[2]
     rest, before, charged = np.empty(n_cells), np.empty(n_cells), np.empty(n_cells)
     inflow = np.empty((2, road.n_segments))
     for k in range(episodes.size):
         for g in range(n_groups):
-            paid, rate = tracer[episodes[k], g], rates[episodes[k], g]
+            paid, rate = spent[episodes[k], g], rates[episodes[k], g]
             copy_vector(paid, before)
             _carry(road, density[k], speed[k], before, paid, inflow)
             _remaining(road, speed[k], rate, rest)
@@ -240,7 +240,7 @@ def _carry(
     after: FloatArray,
     inflow: FloatArray,
 ) -> None:
-    """Mix the tracer on each segment with that of the vehicles that arrived in a second."""
+    """Mix what is spent on each segment with that of the vehicles that arrived in a second."""
     flow, mass = inflow[0], inflow[1]
     flow[:], mass[:] = 0.0, 0.0
     for e in range(road.edges.shape[0]):

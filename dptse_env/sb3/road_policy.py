@@ -41,7 +41,7 @@ CENTRES = {
     "fixed_density_innovation": (0.0, 1.5),
     "fixed_speed_innovation": (0.0, 1.5),
     "last_price": (0.0, 1.0),
-    "tracer": (0.5, 0.3),
+    "spent_share": (0.5, 0.3),
 }
 """Centre and scale of each block's values, chosen so that channels are of order one. They are
 constants rather than running statistics, which could be lost between training and use."""
@@ -50,7 +50,7 @@ MAINLINE_BLOCKS = (
     "density", "speed", "density_log_std", "speed_log_std", "density_innovation",
     "speed_innovation", "age", "queried",
 )  # fmt: skip
-PRICE_BLOCKS = ("last_price", "tracer")
+PRICE_BLOCKS = ("last_price", "spent_share")
 """Blocks with channels where the observation has them."""
 
 RAMP_BLOCKS = ("density", "speed", "density_log_std", "speed_log_std")

@@ -45,9 +45,9 @@ class PublicState(NamedTuple):
         picked: Options picked so far for the next query, shape (k, G).
         prices: Price of the last query of each option, shape (k, G); zero where there was none.
             None where queries have no prices.
-        tracer: The release model's public account of what a vehicle on each mainline segment has
-            been charged on average, over its budget, in [0, 1], shape (k, n_mainline). None where
-            queries have no prices.
+        spent_share: The release model's public account of what a vehicle on each mainline segment
+            has been charged on average, over its budget, in [0, 1], shape (k, n_mainline). None
+            where queries have no prices.
     """
 
     estimate: Estimate
@@ -57,7 +57,7 @@ class PublicState(NamedTuple):
     queried: BoolArray
     picked: BoolArray
     prices: FloatArray | None = None
-    tracer: FloatArray | None = None
+    spent_share: FloatArray | None = None
 
 
 class ObservationBlock(Protocol):
@@ -190,7 +190,8 @@ SHIPPED_BLOCKS = (
     Block("picked", _options, 0, 1, "picked", is_default=lambda _, one_by_one: one_by_one),
     Block("last_price", _options, -5, 5, "prices", lambda _: PRICE_UNIT, transform=_log_price,
           is_default=lambda task, _: task.has_prices),
-    Block("tracer", _mainline, 0, 1, "tracer", is_default=lambda task, _: task.has_prices),
+    Block("spent_share", _mainline, 0, 1, "spent_share",
+          is_default=lambda task, _: task.has_prices),
 )  # fmt: skip
 """The shipped blocks; the default observation has those that are in it, in this order."""
 

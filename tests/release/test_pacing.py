@@ -49,17 +49,17 @@ def seconds_on(speed, length=LENGTH):
     return 3600.0 * length / np.clip(speed, 8.0, 102.0)
 
 
-# --- the tracer ------------------------------------------------------------------------------
+# --- the spent share ------------------------------------------------------------------------------
 
 
-class PlainTracer:
+class PlainPacing:
     """A `TripPacing` of one episode and one group, with its part of the budget."""
 
     def __init__(self, task, group):
         self.task, self.budget = task, BUDGET * task.shares[group]
         self.road, self.columns = task.corridor.road, np.flatnonzero(task.channels.group == group)
         queries, always = task.queries, [c for c in task.always if c in self.columns]
-        self.rate, self.tracer = np.zeros((2, task.n_cells))
+        self.rate, self.spent = np.zeros((2, task.n_cells))
         self.rate[task.channels.first[always]] = 1.0
         if group == 0:
             bought = queries.bandwidth * np.mean(queries.span / queries.cost)
@@ -73,23 +73,23 @@ class PlainTracer:
 
     def prices(self, observed, density, speed):
         """Prices of the group's columns."""
-        self.tracer = self.carried(density, speed)
+        self.spent = self.carried(density, speed)
         rest = self.remaining(speed)
-        left = np.maximum(PACE * self.budget - self.tracer, 0.01 * self.budget)
-        prices, seen = {}, np.zeros_like(self.tracer)
+        left = np.maximum(PACE * self.budget - self.spent, 0.01 * self.budget)
+        prices, seen = {}, np.zeros_like(self.spent)
         for c in self.columns:
             first = self.task.channels.first[c]
             covered = slice(first, first + self.task.channels.span[c])
             prices[c] = (left[covered] / rest[covered]).mean()
             if observed[c]:
                 seen[covered] += prices[c]
-        self.tracer = self.tracer + SHARE * seen
+        self.spent = self.spent + SHARE * seen
         self.rate += ((seen > 0.0) - self.rate) / 60.0
         return np.array(list(prices.values()))
 
     def carried(self, density, speed):
-        """The tracer after predicted flows have mixed it for a second."""
-        road, old, new = self.road, self.tracer, self.tracer.copy()
+        """What is spent after predicted flows have mixed it for a second."""
+        road, old, new = self.road, self.spent, self.spent.copy()
         flow = density * speed
         for s, length in enumerate(self.lengths):
             arriving = [
@@ -102,7 +102,7 @@ class PlainTracer:
             total = sum(each for each, _ in arriving)
             if total > 0.0:
                 part = min(total / 3600.0 / (length * max(density[s], 1e-9)), 1.0)
-                mean = sum(each * tracer for each, tracer in arriving) / total
+                mean = sum(each * spent for each, spent in arriving) / total
                 new[s] = old[s] + part * (mean - old[s])
         moved = np.minimum(speed / 3600.0 / self.lengths, 1.0)
         for s, place in self.before.items():  # vehicles enter with nothing
@@ -113,7 +113,7 @@ class PlainTracer:
 
     def remaining(self, speed):
         """Queried seconds to the end of a trip that keeps to the mainline where it can."""
-        seconds, rest = seconds_on(speed, self.lengths), np.zeros_like(self.tracer)
+        seconds, rest = seconds_on(speed, self.lengths), np.zeros_like(self.spent)
         # Of two that follow, the lower one is on the mainline.
         following = dict(sorted(map(tuple, self.road.edges), reverse=True))
 
@@ -140,11 +140,11 @@ ROADS = {
 
 
 @pytest.mark.parametrize("keywords", ROADS.values(), ids=ROADS)
-def test_prices_and_the_tracer_are_as_when_written_out(keywords):
+def test_prices_and_the_spent_share_are_as_when_written_out(keywords):
     """In free, in dense and in no traffic; some of the budget's end is reached."""
     pacing, generator = make(**keywords), np.random.default_rng(0)
     task = pacing.task
-    plain = [PlainTracer(task, group) for group in range(len(task.groups))]
+    plain = [PlainPacing(task, group) for group in range(len(task.groups))]
     n, n_segments = task.corridor.n_mainline, task.corridor.n_segments
     for second in range(150):
         density = generator.choice([0.0, 10.0, 60.0, 250.0], n_segments)
@@ -155,8 +155,8 @@ def test_prices_and_the_tracer_are_as_when_written_out(keywords):
         (found,) = prices_of(pacing, observed, density, speed)
         expected = [each.prices(observed, density, speed) for each in plain]
         np.testing.assert_allclose(found, np.concatenate(expected), rtol=1e-9)
-        part = np.minimum(plain[0].tracer[:n] / plain[0].budget, 1.0)
-        np.testing.assert_allclose(pacing.tracer(ONE)[0], part, rtol=1e-9)
+        part = np.minimum(plain[0].spent[:n] / plain[0].budget, 1.0)
+        np.testing.assert_allclose(pacing.spent_share(ONE)[0], part, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("speed", "bandwidth"), [(2.0, 1), (50.0, 6), (110.0, 6)])
@@ -194,11 +194,11 @@ def test_episodes_do_not_meet_and_a_reset_begins_anew():
         together = prices_of(batch, [second % 6], 20.0, 40.0, others)
         alone = prices_of(single, [second % 6], 20.0, 40.0)
         np.testing.assert_array_equal(together, np.repeat(alone, 2, axis=0))
-    np.testing.assert_array_equal(batch.tracer(others), single.tracer(ONE)[[0, 0]])
-    assert not batch.tracer(np.array([1])).any()
+    np.testing.assert_array_equal(batch.spent_share(others), single.spent_share(ONE)[[0, 0]])
+    assert not batch.spent_share(np.array([1])).any()
     batch.reset(np.array([2]))
     for episode in np.array([[1], [2]]):
-        assert not batch.tracer(episode).any()
+        assert not batch.spent_share(episode).any()
         np.testing.assert_array_equal(prices_of(batch, NOTHING, 20.0, 40.0, episode), fresh)
 
 
@@ -226,4 +226,4 @@ def test_single_queries_of_a_second_have_the_whole_of_their_group_s():
     prices, whole = prices_of(pacing, [0, 3, 5, 8])[0], BUDGET / (1.0 + RATIO)
     np.testing.assert_allclose(prices, whole * np.where(np.arange(9) < N, 0.75, 0.25))
     np.testing.assert_allclose(pacing.expected_prices(np.full(S, 60.0)), [0.75, 0.25])
-    assert not pacing.tracer(ONE).any()
+    assert not pacing.spent_share(ONE).any()

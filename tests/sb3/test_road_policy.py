@@ -65,11 +65,11 @@ def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
     assert [np.flatnonzero(mark).tolist() for mark in road.marks] == [[3, 9], [5, 11], [14]]
 
 
-def test_prices_and_the_tracer_are_channels_where_they_are_observed():
+def test_prices_and_the_spent_share_are_channels_where_they_are_observed():
     named = [RoadChannels.from_config(resolve("short-highway", {"privacy": privacy})).channels
              for privacy in (SumRelease, PricedRelease)]  # fmt: skip
     without, priced = ({channel.name for channel in channels} for channels in named)
-    assert priced - without == {"mainline last_price", "mainline tracer"}
+    assert priced - without == {"mainline last_price", "mainline spent_share"}
 
 
 # The policy.
