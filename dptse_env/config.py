@@ -89,7 +89,7 @@ class EnvConfig:
             corridor's name, if one ships, else the estimator's defaults. Parameters of one's own
             take those of the shipped ones that they were derived from.
         bandwidth: Largest total cost of the queries of a step, in ``bandwidth_unit``; by default a
-            number of mainline segments. `resolve` limits a default to those that there are.
+            number of mainline segments, at most those that there are.
         query_spans: Numbers of neighbouring mainline segments that one query may cover, ascending.
             Several segments are released as one sum. Others than 1 need a release model that
             releases sums.
@@ -108,8 +108,8 @@ class EnvConfig:
             ``"package.module:function"``, or a function of a `ScoredSecond`.
         horizon: Length of an episode [s]; None for the whole record.
         random_start: Whether an episode starts at a random second of the record.
-        traffic_seeds: Traffic seeds to draw episodes from; on a road with recordings `resolve` puts
-            the recorded training seeds in place of this default.
+        traffic_seeds: Traffic seeds to draw episodes from, as a list or ``"first:stop"``; on a road
+            with recordings by default all training seeds that were recorded.
         truth_in_info: Whether ``info`` shows the true traffic.
         inherited: Keywords whose values were measured or tuned on another road than this one, or
             with other ARZ parameters, and that nobody gave; as `resolve` finds them.
@@ -203,6 +203,11 @@ class EnvConfig:
         return self.corridor.duration - self.horizon_steps
 
     @property
+    def release_model(self) -> Any:
+        """The class of the release model."""
+        return RELEASE_MODELS.find(self.privacy.preset)
+
+    @property
     def settings_name(self) -> str | None:
         """Name of the shipped set of estimator settings in force; None if there is none."""
         given = self.estimator_settings
@@ -285,10 +290,6 @@ def _with_model(privacy: PrivacySettings) -> str:
     return f"with the release model {RELEASE_MODELS.name_of(privacy.preset)!r}"
 
 
-def _knows_groups(privacy: PrivacySettings) -> bool:
-    return bool(RELEASE_MODELS.find(privacy.preset).knows_groups)
-
-
 def _penetration(
     path: str, value: Any, base: Penetration, corridor: Corridor, privacy: PrivacySettings
 ) -> Penetration:
@@ -298,7 +299,8 @@ def _penetration(
     whole = found.is_complete or has_vehicles(corridor.recordings)
     require(whole, f"{path}.share", "1 on a road of measured fields", found.share)
     alike = f"1 {_with_model(privacy)}, which knows of no groups of columns"
-    require(found.is_complete or _knows_groups(privacy), f"{path}.share", alike, found.share)
+    is_served = found.is_complete or RELEASE_MODELS.find(privacy.preset).knows_groups
+    require(is_served, f"{path}.share", alike, found.share)
     return found
 
 
@@ -314,7 +316,8 @@ def _detectors(
     has_any = n > 0 and has_vehicles(corridor.recordings)
     require(has_any or found == Detectors(), path, exact, found)
     alike = f"left out {_with_model(privacy)}, which knows of no groups of columns"
-    require(found == Detectors() or _knows_groups(privacy), path, alike, found)
+    is_served = found == Detectors() or RELEASE_MODELS.find(privacy.preset).knows_groups
+    require(is_served, path, alike, found)
     return found
 
 
@@ -622,7 +625,7 @@ def _inherited(
         found.append("estimator_settings")
     inherits = getattr(ESTIMATORS.find(config.estimator), "inherits", None)
     if inherits is not None:
-        centre = RELEASE_MODELS.find(config.privacy.preset).flow_centre(corridor, config.privacy)
+        centre = config.release_model.flow_centre(corridor, config.privacy)
         spans = max(config.query_spans)
         found += inherits(corridor.road, centre is not None, spans, config.settings())
     return tuple(found)

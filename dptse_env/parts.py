@@ -136,7 +136,7 @@ def make_model(config: EnvConfig) -> ARZModel:
 
 def make_task(config: EnvConfig, n_episodes: int = 1) -> Task:
     """Make what is measured in a batch of episodes."""
-    privacy, model = config.privacy, RELEASE_MODELS.find(config.privacy.preset)
+    privacy, model = config.privacy, config.release_model
     return Task(
         name=RELEASE_MODELS.name_of(privacy.preset),
         settings=privacy,
@@ -157,8 +157,8 @@ def make_task(config: EnvConfig, n_episodes: int = 1) -> Task:
 
 def make_traffic(config: EnvConfig, library: RecordLibrary | None = None) -> Traffic:
     """Make the tables of the true traffic; nothing is recorded or loaded."""
-    task, model = make_task(config), RELEASE_MODELS.find(config.privacy.preset)
-    reads_vehicles = model.needs_vehicles or not task.is_whole
+    task = make_task(config)
+    reads_vehicles = config.release_model.needs_vehicles or not task.is_whole
     populations = [group.population for group in task.groups] if reads_vehicles else []
     return Traffic(config.corridor, config.traffic_seeds, library or RecordLibrary(), populations)
 
@@ -173,8 +173,8 @@ def make_release(
         n_episodes: Size n of the batch.
         traffic: The true traffic; made of the user's records if None.
     """
-    task, model = make_task(config, n_episodes), RELEASE_MODELS.find(config.privacy.preset)
-    release: ReleaseModel = model(task, make_traffic(config) if traffic is None else traffic)
+    task, traffic = make_task(config, n_episodes), traffic or make_traffic(config)
+    release: ReleaseModel = config.release_model(task, traffic)
     return release
 
 
@@ -194,7 +194,7 @@ def complete_report(
 
 def warn_where_void(config: EnvConfig) -> None:
     """Warn where a release model that gives a guarantee was asked for, and other fields void it."""
-    if not RELEASE_MODELS.find(config.privacy.preset).claims_guarantee:
+    if not config.release_model.claims_guarantee:
         return
     # Who asks for the truth in info knows that it is shown. Imported and fitted roads are for
     # experiments on their own traffic.

@@ -96,6 +96,9 @@ def test_incident_and_demand_by_name():
     assert isinstance(config.corridor.demand, DemandDistribution)
     assert resolve("paper-highway", {"incident": "none"}).corridor.incident is None
     assert resolve("paper-highway", {"incident": "preset"}).corridor == PAPER_HIGHWAY
+    fields = {"corridor": {"incident": "none", "demand": "random", "duration": 600}}
+    road = dataclasses.replace(config.corridor, incident=None, duration=600)
+    assert resolve("paper-highway", fields).corridor == road
     moved = resolve("paper-highway", {"incident": {"segment": 3}})
     assert moved.corridor.incident.segment == 3
     assert moved.corridor.incident.phases == PAPER_HIGHWAY.incident.phases

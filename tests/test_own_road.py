@@ -91,6 +91,13 @@ def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):
     message = r"short\.toml: corridor\.segment_length must be at least 0\.0567 km .*, got 0\.04 km"
     with pytest.raises(ValueError, match=message + ".* an estimator .*: random_walk, recurrent"):
         make(str(road), parameters="paper")
+    table = {"estimator": "mhe", "estimator_settings": {"mhe": {"horizon": 1000}}}
+    write_corridor(road, ROAD, table)
+    with pytest.raises(ValueError, match=r"short\.toml: environment\.estimator_settings\.mhe\.hor"):
+        make(str(road))
+    with pytest.raises(ValueError, match=r"^estimator_settings\.mhe\.horizon must be"):
+        make(str(road), **table)
+    write_corridor(road, dataclasses.replace(ROAD, segment_length=(0.1,) * 7 + (0.04,)))
     # A random walk does not step the model.
     make(str(road), parameters="paper", estimator="random_walk").reset(seed=0)
 

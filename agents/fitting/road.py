@@ -21,7 +21,6 @@ from dptse_env.config import (
 from dptse_env.evaluation import WARM_UP
 from dptse_env.model import available_parameters
 from dptse_env.model.parameters import LARGEST_W, SECONDS_PER_HOUR
-from dptse_env.release import RELEASE_MODELS
 from dptse_env.traffic import (
     Corridor,
     RecordLibrary,
@@ -174,7 +173,7 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
         decided.append("bandwidth")
         remarks.append(f"bandwidth {third}, a third of the segments")
     is_field = not has_vehicles(corridor.recordings)
-    needs_vehicles = RELEASE_MODELS.find(base.privacy.preset).needs_vehicles
+    needs_vehicles = base.release_model.needs_vehicles
     if is_field and needs_vehicles and "privacy" not in keywords:
         keywords["privacy"] = "corrected"
         decided.append("privacy")

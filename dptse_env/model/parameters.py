@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,7 +19,6 @@ from dptse_env.utils.fields import (
     parse_json,
     read_json,
     require_name,
-    shipped_texts,
     within,
 )
 
@@ -128,7 +128,12 @@ class ARZParameters:
 
 @cache
 def _shipped() -> dict[str, str]:
-    return shipped_texts("dptse_env.model", "sets")
+    entries = sorted((files("dptse_env.model") / "sets").iterdir(), key=lambda entry: entry.name)
+    return {
+        entry.name.removesuffix(".json"): entry.read_text(encoding="utf-8")
+        for entry in entries
+        if entry.name.endswith(".json")
+    }
 
 
 def available_parameters() -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from dptse_env.traffic.corridor import Recordings
 from dptse_env.traffic.record import InvalidRecordError, Record
-from dptse_env.utils.fields import integer, parse_object
+from dptse_env.utils.fields import check_object, integer, parse_json
 from dptse_env.utils.files import json_digest
 
 MANIFEST = "manifest.json"
@@ -148,7 +148,8 @@ def _manifest(recordings: Recordings) -> dict[str, Any]:
     try:
         if path.stat().st_size > LARGEST_MANIFEST:
             raise InvalidRecordError(f"{path} must have at most {LARGEST_MANIFEST} bytes")
-        manifest = parse_object(path.read_bytes(), str(path), _KEYS)
+        content = parse_json(path.read_bytes(), str(path))
+        manifest = check_object(content, str(path), _KEYS)
     except OSError as problem:
         message = f"{path}: recordings cannot be read: {problem.strerror}"
         raise InvalidRecordError(message) from problem

@@ -19,7 +19,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
@@ -336,31 +335,6 @@ def non_negative(path: str, value: object) -> float:
 def inside(path: str, value: object, low: float, high: float) -> float:
     """Return `value` as a ``float`` strictly between `low` and `high`, or raise ``ValueError``."""
     return number(float, value, path, Interval(low, high, open_low=True, open_high=True))
-
-
-def shipped_texts(package: str, folder: str) -> dict[str, str]:
-    """Return the JSON files in a folder of a package by name, without the suffix and sorted."""
-    entries = sorted((files(package) / folder).iterdir(), key=lambda entry: entry.name)
-    return {
-        entry.name.removesuffix(".json"): entry.read_text(encoding="utf-8")
-        for entry in entries
-        if entry.name.endswith(".json")
-    }
-
-
-def parse_object(text: str | bytes, path: str, keys: Mapping[str, type]) -> dict[str, Any]:
-    """Parse a JSON object that has exactly the given keys.
-
-    Args:
-        text: The JSON, as text or as the bytes of a file.
-        path: Its path, for error messages.
-        keys: Type of each value by its key.
-
-    Raises:
-        ValueError: It is no JSON, no object, or has other keys or types; the message starts with
-            ``path``.
-    """
-    return check_object(parse_json(text, path), path, keys)
 
 
 def parse_json(text: str | bytes, path: str) -> Any:
