@@ -111,7 +111,7 @@ def make_interface(config: EnvConfig) -> QueryInterface:
         ValueError: A part of another package is not what is expected.
     """
     encoding, queries = ACTION_ENCODINGS.find(config.action), config.queries
-    actions = encoding(queries.n_options, queries.bandwidth, queries.cost)
+    actions = encoding(queries)
     return QueryInterface(
         queries=queries,
         actions=actions,

@@ -124,7 +124,7 @@ class Traffic:
             times: Seconds of their records, shape (k,).
             n_places: Number of record columns; None for the S segments.
         """
-        rows: FloatArray = self._table[indices, times, : n_places or self.corridor.n_segments]
+        rows: FloatArray = self._table[indices, times, : n_places or self.corridor.road.n_segments]
         return rows
 
     def complete(self, index: int) -> FloatArray:

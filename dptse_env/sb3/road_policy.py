@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface
+from dptse_env.road import DIVERGE, MERGE
 from dptse_env.sb3.plackett_luce import PlackettLuce
 from dptse_env.sb3.vec_env import config_of
 
@@ -113,11 +115,10 @@ class RoadChannels:
         starts = {name: place.start for name, place in encoding.slices.items()}
         released = [name for name in starts if name.startswith("released_")]
         prices = [name for name in PRICE_BLOCKS if name in starts]
-        # Of a ramp with several segments, the one that touches the mainline.
-        on_ramps = zip(corridor.on_ramp_segments, corridor.on_ramps, strict=True)
-        off_ramps = zip(corridor.off_ramp_segments, corridor.off_ramps, strict=True)
-        joins = {segments[-1]: face for segments, face in on_ramps}
-        leaves = {segments[0]: face - 1 for segments, face in off_ramps}
+        road = corridor.road
+        parties = road.parties.tolist()
+        joins = {s: parties[s][1] for s in np.flatnonzero(road.kind == MERGE).tolist() if s >= n}
+        leaves = {parties[s][2]: s for s in np.flatnonzero(road.kind == DIVERGE).tolist()}
         channels = [
             _channel(name, starts, {i: i for i in range(n)}, n, "mainline")
             for name in (*MAINLINE_BLOCKS, *released, *prices)

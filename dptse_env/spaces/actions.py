@@ -17,6 +17,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from dptse_env.release import QueryOptions
 from dptse_env.utils.arrays import Action, BoolArray, IntArray
 from dptse_env.utils.kernels import kernel
 from dptse_env.utils.registry import Registry, name_of_class
@@ -144,10 +145,10 @@ class ActionEncoding(ABC):
 
     picks_one_by_one: ClassVar[bool] = False
 
-    def __init__(self, n_options: int, bandwidth: int, costs: IntArray) -> None:
+    def __init__(self, queries: QueryOptions) -> None:
         """Store the sizes, and the space that they give."""
-        self.n_options, self.bandwidth, self.costs = n_options, bandwidth, costs
-        self.most_queries = int(np.count_nonzero(np.cumsum(np.sort(costs)) <= bandwidth))
+        self.n_options, self.most_queries = queries.n_options, queries.most_queries
+        self.bandwidth, self.costs = queries.bandwidth, queries.cost
         self.space = self.make_space()
         self._shape = self.space.shape or ()
 
@@ -405,4 +406,4 @@ ACTION_ENCODINGS = Registry(
     },
     check=_expected,
 )
-"""Action encodings by name, each a class made of (n_options, bandwidth, costs)."""
+"""Action encodings by name, each a class made of `QueryOptions`."""

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dptse_env.release import QueryOptions
 from dptse_env.spaces.actions import (
     ACTION_ENCODINGS,
     MaskAction,
@@ -21,11 +22,16 @@ COSTS = np.array([1, 1, 1, 1, 2, 2, 2, 3])
 SEEDS = st.integers(0, 2**32 - 1)
 
 
+def queries(bandwidth, costs):
+    n = len(costs)
+    return QueryOptions(np.arange(n), np.ones(n, dtype=np.int64), np.asarray(costs), n, bandwidth)
+
+
 class Played:
     """An encoding, and the state of one episode."""
 
     def __init__(self, kind, bandwidth=2, costs=EQUAL):
-        self.encoding = kind(len(costs), bandwidth, costs)
+        self.encoding = kind(queries(bandwidth, costs))
         self.pending = PendingPicks(1, len(costs))
 
     def decode(self, action):
@@ -219,7 +225,7 @@ def test_bad_actions_are_refused_and_leave_no_trace(kind, action, message):
 
 
 def test_episodes_of_a_batch_rotate_on_their_own():
-    encoding, pending = MaskAction(6, 2, EQUAL), PendingPicks(3, 6)
+    encoding, pending = MaskAction(queries(2, EQUAL)), PendingPicks(3, 6)
     everything = np.ones((3, 6), dtype=np.int8)
     encoding.decode(np.array([1]), everything[:1], pending)
     queried = encoding.decode(np.arange(3), everything, pending).queried
