@@ -12,7 +12,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Annotated, Any, NamedTuple
 
-from dptse_env.estimators import ESTIMATORS, check_estimator, checked_settings, settings_type
+from dptse_env.estimators import (
+    ESTIMATORS,
+    Estimator,
+    check_estimator,
+    checked_settings,
+    settings_type,
+)
 from dptse_env.estimators.settings import (
     read_settings,
     tuned_estimator,
@@ -623,9 +629,8 @@ def _inherited(
     is_other = is_other_road or parameters != load_parameters(tuned_with(parameters))
     if is_other and config.settings_name is not None and "estimator_settings" not in given:
         found.append("estimator_settings")
-    inherits = getattr(ESTIMATORS.find(config.estimator), "inherits", None)
-    if inherits is not None:
-        centre = config.release_model.flow_centre(corridor, config.privacy)
-        spans = max(config.query_spans)
-        found += inherits(corridor.road, centre is not None, spans, config.settings())
+    centre = config.release_model.flow_centre(corridor, config.privacy)
+    estimator: type[Estimator] = ESTIMATORS.find(config.estimator)
+    spans = max(config.query_spans)
+    found += estimator.inherits(corridor.road, centre is not None, spans, config.settings())
     return tuple(found)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dptse_env.config import EnvConfig
-from dptse_env.estimators import Estimate, Measurement, check_estimate
+from dptse_env.estimators import Estimate, Measurement
 from dptse_env.measurement import nominal_state
 from dptse_env.parts import Parts, complete_report
 from dptse_env.release import Request, check_released
@@ -265,7 +265,7 @@ class QueryProcess:
         """Store the estimator's present output; return that of ``episodes``."""
         self.estimate = self.estimator.estimate()
         if self._checks_estimates:
-            check_estimate(self.estimator, self.estimate, self.model.n_segments)
+            self.estimator.check_estimate(self.estimate)
         return self.estimate.at(episodes)
 
     def _score(self, episodes: IntArray, estimate: Estimate) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dptse_env import register_part
-from dptse_env.estimators import Estimate
+from dptse_env.estimators import Estimate, Estimator
 from dptse_env.schedules import make_schedule
 from tests.helpers import SHORT, assert_same, lock_step, play
 
@@ -126,23 +126,27 @@ def test_a_name_is_valid_and_stands_for_one_part():
         register_part("reward", "cheap", lambda second: second.error.density)
 
 
-class NoUpdate:
+class Duck:
     def reset(self): ...
     def predict(self): ...
+    def update(self): ...
     def estimate(self): ...
 
 
-class NoInnovations(NoUpdate):
-    is_compiled = False
+class NoUpdate(Estimator):
+    def _reset(self): ...
+    def _predict(self): ...
+    def _estimate(self): ...
 
+
+class NoInnovations(parts.Smoothed):
     def __init__(self, model, n_episodes, settings):
-        self.n_episodes = n_episodes
-
-    def update(self): ...
+        super().__init__(model, n_episodes, settings)
+        self.innovations = None
 
 
 class Nan(parts.Smoothed):
-    def estimate(self):
+    def _estimate(self):
         return Estimate(*[np.full_like(self.traffic[..., 0], np.nan)] * 4)
 
 
@@ -189,7 +193,8 @@ UNKNOWN = {"estimator": parts.Smoothed, "estimator_settings": {"gain": 1}}
 BAD = [
     ("make", {"estimator": "no_module:Filter"}, "estimator .* cannot be imported: ModuleNotFoundE"),
     ("make", {"estimator": f"{HERE}:Missing"}, f"estimator .* {HERE} has no 'Missing'; .*py"),
-    ("make", {"estimator": NoUpdate}, r"estimator .*:NoUpdate must have update\(\)"),
+    ("make", {"estimator": Duck}, r"estimator .*:Duck must be a subclass of dptse_env\.estimators"),
+    ("make", {"estimator": NoUpdate}, r"estimator .*:NoUpdate must have _update\(\)"),
     ("make", {"privacy": NoUpdate}, r"privacy\.preset .*:NoUpdate must be a subclass of"),
     ("make", {"observation": ["default", Clash]}, "observation .*:Clash must not be named 'age'"),
     ("make", UNKNOWN, "estimator_settings.gain is unknown; allowed"),

@@ -1,11 +1,9 @@
-"""Traffic state estimators with a common protocol, by name and backend."""
+"""Traffic state estimators, by name and backend."""
 
 from pkgutil import resolve_name
 from typing import Any, get_args
 
-import numpy as np
-
-from dptse_env.estimators.base import Backend, BatchEstimator, Estimate, Estimator, Measurement
+from dptse_env.estimators.base import Backend, Estimate, Estimator, Measurement
 from dptse_env.estimators.settings import (
     AdaptiveSmoothingSettings,
     BlendSettings,
@@ -20,14 +18,13 @@ from dptse_env.estimators.settings import (
 )
 from dptse_env.model import ARZModel
 from dptse_env.utils.fields import shown
-from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
+from dptse_env.utils.registry import Registry, is_foreign
 
 __all__ = [
     "BACKENDS",
     "ESTIMATORS",
     "REFERENCES",
     "AdaptiveSmoothingSettings",
-    "BatchEstimator",
     "BlendSettings",
     "DemandSettings",
     "EnsembleSettings",
@@ -39,7 +36,6 @@ __all__ = [
     "MixtureSettings",
     "RecurrentSettings",
     "SigmaPointSettings",
-    "check_estimate",
     "check_estimator",
     "check_settings",
     "checked_settings",
@@ -50,9 +46,10 @@ __all__ = [
 
 
 def _expected(part: Any) -> str | None:
-    if isinstance(part, type):
-        return missing_methods(part, ("reset", "predict", "update", "estimate"))
-    return None if callable(part) else "be a class, or callable with (model, n_episodes, settings)"
+    if not (isinstance(part, type) and issubclass(part, Estimator)):
+        return "be a subclass of dptse_env.estimators.Estimator"
+    lacking = ", ".join(f"{name}()" for name in sorted(part.__abstractmethods__))
+    return f"have {lacking}" if lacking else None
 
 
 ESTIMATORS = Registry(
@@ -71,9 +68,7 @@ ESTIMATORS = Registry(
     },
     check=_expected,
 )
-"""Estimators by name, classes or functions of (model, n_episodes, settings), imported when they are
-asked for. Their attribute ``settings_type`` may be a dataclass of other settings; a class without
-demand states has ``has_demand`` False, one that does not step the model ``steps_model`` False."""
+"""Estimators by name, imported when they are asked for."""
 REFERENCES = {
     "ekf": "dptse_env.estimators.reference:ReferenceEKF",
     "ukf": "dptse_env.estimators.reference:ReferenceUKF",
@@ -90,7 +85,7 @@ def check_demand(estimator: Any, settings: Any) -> None:
     Raises:
         ValueError: It has none.
     """
-    has_demand = getattr(ESTIMATORS.find(estimator), "has_demand", True)
+    has_demand = ESTIMATORS.find(estimator).has_demand
     if not has_demand and settings.demand is not None:
         raise ValueError(
             f"estimator_settings.demand must be None for {estimator!r}, which has no demand states"
@@ -100,18 +95,13 @@ def check_demand(estimator: Any, settings: Any) -> None:
 def check_settings(estimator: Any, model: ARZModel, settings: Any) -> None:
     """Refuse settings that an estimator cannot have on a road; it is not made.
 
-    A class may have a static method ``check_settings(model, settings)``, which raises
-    ``ValueError``. The model has the demand states that the settings ask for.
-
     Raises:
         ValueError: A setting is out of range on this road, the estimator has no demand states, or
             it steps the model and its time step violates the CFL condition.
     """
     check_demand(estimator, settings)
     require_time_step(estimator, model)
-    check = getattr(ESTIMATORS.find(estimator), "check_settings", None)
-    if check is not None:
-        check(with_demand(model, settings), settings)
+    ESTIMATORS.find(estimator).check_settings(with_demand(model, settings), settings)
 
 
 def require_time_step(estimator: Any, model: ARZModel) -> None:
@@ -120,20 +110,16 @@ def require_time_step(estimator: Any, model: ARZModel) -> None:
     Raises:
         ValueError: The model's time step violates the CFL condition.
     """
-    if not _steps_model(ESTIMATORS.find(estimator)):
+    if not ESTIMATORS.find(estimator).steps_model:
         return
     try:
         model.require_time_step()
     except ValueError as problem:
-        free = ", ".join(name for name in ESTIMATORS if not _steps_model(ESTIMATORS.find(name)))
+        free = ", ".join(name for name in ESTIMATORS if not ESTIMATORS.find(name).steps_model)
         raise ValueError(
             f"{problem}; or choose other parameters, or an estimator that does not step the "
             f"model: {free}"
         ) from problem
-
-
-def _steps_model(part: Any) -> bool:
-    return bool(getattr(part, "steps_model", True))
 
 
 def with_demand(model: ARZModel, settings: Any) -> ARZModel:
@@ -178,13 +164,13 @@ def make_estimator(
     part: Any = resolve_name(REFERENCES[estimator]) if reference else ESTIMATORS.find(estimator)
     made: Estimator = part(with_demand(model, settings), n_episodes, settings)
     if is_foreign(made):
-        _check_attributes(made, model, n_episodes)
+        made.check_arrays()
     return made
 
 
 def settings_type(estimator: Any) -> type:
     """Return the dataclass of an estimator's settings."""
-    cls: type = getattr(ESTIMATORS.find(estimator), "settings_type", EstimatorSettings)
+    cls: type = ESTIMATORS.find(estimator).settings_type
     return cls
 
 
@@ -219,50 +205,3 @@ def check_estimator(estimator: Any, backend: str) -> None:
             f"backend must be 'compiled' for {ESTIMATORS.name_of(estimator)!r}, only "
             f"{', '.join(REFERENCES)} have a reference; got 'reference'"
         )
-
-
-def check_estimate(estimator: Estimator, estimate: Estimate, n_segments: int) -> None:
-    """Refuse an estimate that is not finite or not of shape (n, S).
-
-    Estimators of this package are reset when they diverge; those of other packages may not be.
-    """
-    shape = estimator.n_episodes, n_segments
-    for name in ("density", "speed", "density_std", "speed_std"):
-        values = np.asarray(getattr(estimate, name, None))
-        got = f"{values.dtype} of shape {values.shape}"
-        if values.shape == shape and values.dtype.kind == "f":
-            if np.isfinite(values).all():
-                continue
-            episode, segment = np.argwhere(~np.isfinite(values))[0].tolist()
-            got = f"{values[episode, segment]} in episode {episode}, segment {segment}"
-        raise ValueError(
-            f"estimator {name_of_class(estimator)}.estimate() must return finite floats "
-            f"{name!r} of shape {shape}, got {got}"
-        )
-
-
-def _check_attributes(estimator: Estimator, model: ARZModel, n_episodes: int) -> None:
-    """Refuse an estimator whose methods, arrays or attributes do not follow the protocol."""
-    name = name_of_class(estimator)
-    missing = missing_methods(estimator, ("reset", "predict", "update", "estimate"))
-    if missing is not None:
-        raise ValueError(f"estimator {name} must {missing}")
-    shapes = {
-        "innovations": (n_episodes, model.channels.size, 2),
-        "diverged": (n_episodes,),
-        "fallback": (n_episodes,),
-    }
-    for attribute, shape in shapes.items():
-        found = getattr(estimator, attribute, None)
-        if not isinstance(found, np.ndarray) or found.shape != shape:
-            got = "none" if found is None else f"shape {np.shape(found)}"
-            raise ValueError(
-                f"estimator {name} must have an array {attribute!r} of shape {shape}, got {got}"
-            )
-    found = getattr(estimator, "n_episodes", None)
-    if found != n_episodes:
-        message = f"estimator {name} must have 'n_episodes' equal to {n_episodes}, got {found!r}"
-        raise ValueError(message)
-    if getattr(estimator, "is_compiled", None) is None:
-        raise ValueError(f"estimator {name} must have 'is_compiled', got None")
-    check_estimate(estimator, estimator.estimate(), model.n_segments)

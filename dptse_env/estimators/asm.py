@@ -53,7 +53,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.base import Estimate, KernelEstimator, Measurement
 from dptse_env.estimators.settings import AdaptiveSmoothingSettings, EstimatorSettings
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
@@ -109,75 +109,12 @@ class State(NamedTuple):
     place: IntArray  # (n,) where the present one is
     sums: FloatArray  # (n, S, 2, 5) of both waves
     present: FloatArray  # (n, S, 4) density, speed and their deviations
+    priors: FloatArray  # (n, S, 4)
     smoothed: FloatArray  # (n, S, 2) variances of what is smoothed away, without their factors
     age: FloatArray  # (n, S) seconds since the last release within reach
     evidence: FloatArray  # (n, S, 2, 2) sums of the factors' numerators and denominators
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
-
-
-class AdaptiveSmoothing(BatchEstimator):
-    """Adaptive smoothing of released values.
-
-    It has no traffic model; the ARZ parameters serve to read densities and speeds off the model's
-    inputs. Errors of different segments and of density and speed count as independent.
-
-    Attributes:
-        state: Sums and estimates, which predictions and updates change in place.
-    """
-
-    is_compiled: ClassVar[bool] = True
-    has_demand: ClassVar[bool] = False
-    steps_model: ClassVar[bool] = False
-
-    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
-        """See `make_estimator`."""
-        super().__init__(model, n_episodes, settings)
-        stencil, n, S = make_stencil(model, settings.asm), n_episodes, model.n_segments
-        shape = n, stencil.first.size - 1, int(stencil.delay.max()) + 2, 5
-        self.state = State(
-            past=np.zeros(shape),
-            place=np.zeros(n, dtype=np.int64),
-            sums=np.zeros((n, S, 2, 5)),
-            present=np.zeros((n, S, 4)),
-            smoothed=np.zeros((n, S, 2)),
-            age=np.zeros((n, S)),
-            evidence=np.zeros((n, S, 2, 2)),
-            innovations=self.innovations,
-            diverged=self.diverged,
-        )
-        self._prior = np.zeros((n, S, 4))
-        scale = np.array([model.density_scale, model.speed_scale])
-        self._prior[..., 2:] = np.sqrt(settings.initial_variance) * scale
-        self.state.present[:] = self._prior
-        self._bundle = Bundle(model.road, model.arz, model.channels, stencil, self.state)
-
-    @property
-    def means(self) -> FloatArray:
-        """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
-        return self.state.present[..., :2]
-
-    def _reset(
-        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
-    ) -> None:
-        density, speed = estimated_traffic(self.model, states)
-        self._prior[episodes, :, 0], self._prior[episodes, :, 1] = density, speed
-        self._restart(episodes)
-
-    def _restart(self, episodes: IntArray) -> None:
-        restart(self._bundle, episodes, self._prior)
-
-    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        predict(self._bundle, episodes, inputs)
-
-    def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        update(self._bundle, episodes, measured)
-        lost = episodes[self.diverged[episodes]]
-        if lost.size > 0:
-            self._restart(lost)
-
-    def _estimate(self) -> Estimate:
-        return Estimate(*(self.state.present[..., j].copy() for j in range(4)))
 
 
 def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stencil:
@@ -259,26 +196,30 @@ def neighbours(model: ARZModel, reach: float) -> Iterator[dict[int, float]]:
 
 
 @kernel
-def restart(bundle: Bundle, episodes: IntArray, prior: FloatArray) -> None:
-    """Begin episodes `(k,)` with their prior `(n, S, 4)` as the values of a second."""
+def restart(bundle: Bundle, episodes: IntArray) -> None:
+    """Begin episodes `(k,)` with their priors as the values of a second."""
     road, _, _, _, state = bundle.parts
-    for k in range(episodes.size):
-        e = episodes[k]
-        past = state.past[e]
-        past[:] = 0.0
-        state.place[e] = 0
-        state.evidence[e] = CONFIDENCE
-        state.age[e] = 0.0
-        state.innovations[e] = 0.0
-        for s in range(road.n_segments):
-            lanes, known = road.lanes[s], past[s, 0]
-            known[WEIGHT] = 1.0
-            known[DENSITY], known[SPEED] = prior[e, s, 0] / lanes, prior[e, s, 1]
-            known[DENSITY_NOISE] = (prior[e, s, 2] / lanes) ** 2
-            known[SPEED_NOISE] = prior[e, s, 3] ** 2
-            for j in range(4):
-                state.present[e, s, j] = prior[e, s, j]
-            state.smoothed[e, s] = 0.0
+    for e in episodes:
+        _restart(road, state, e)
+
+
+@kernel_part
+def _restart(road: Road, state: State, e: int) -> None:
+    past, prior = state.past[e], state.priors[e]
+    past[:] = 0.0
+    state.place[e] = 0
+    state.evidence[e] = CONFIDENCE
+    state.age[e] = 0.0
+    state.innovations[e] = 0.0
+    for s in range(road.n_segments):
+        lanes, known = road.lanes[s], past[s, 0]
+        known[WEIGHT] = 1.0
+        known[DENSITY], known[SPEED] = prior[s, 0] / lanes, prior[s, 1]
+        known[DENSITY_NOISE] = (prior[s, 2] / lanes) ** 2
+        known[SPEED_NOISE] = prior[s, 3] ** 2
+        for j in range(4):
+            state.present[e, s, j] = prior[s, j]
+        state.smoothed[e, s] = 0.0
 
 
 @kernel
@@ -452,6 +393,8 @@ def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
         # Estimates are clipped, so that they do not show it.
         state.diverged[e] = not all_finite(state.sums[e].reshape(-1))
         _evaluate(road, arz, stencil, state, e)
+        if state.diverged[e]:
+            _restart(road, state, e)
 
 
 @kernel_part
@@ -527,3 +470,56 @@ def _add(stencil: Stencil, state: State, e: int, s: int, value: FloatArray) -> N
         for c in range(DENSITY_NOISE, 5):
             out[c] += f[1, 0] * value[c]
         state.age[e, stencil.target[q]] = 0.0
+
+
+class AdaptiveSmoothing(KernelEstimator):
+    """Adaptive smoothing of released values.
+
+    It has no traffic model; the ARZ parameters serve to read densities and speeds off the model's
+    inputs. Errors of different segments and of density and speed count as independent.
+
+    Attributes:
+        state: Sums and estimates, which predictions and updates change in place.
+    """
+
+    has_demand: ClassVar[bool] = False
+    steps_model: ClassVar[bool] = False
+    predict_kernel = staticmethod(predict)
+    update_kernel = staticmethod(update)
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        stencil, n, S = make_stencil(model, settings.asm), n_episodes, model.n_segments
+        shape = n, stencil.first.size - 1, int(stencil.delay.max()) + 2, 5
+        self.state = State(
+            past=np.zeros(shape),
+            place=np.zeros(n, dtype=np.int64),
+            sums=np.zeros((n, S, 2, 5)),
+            present=np.zeros((n, S, 4)),
+            priors=np.zeros((n, S, 4)),
+            smoothed=np.zeros((n, S, 2)),
+            age=np.zeros((n, S)),
+            evidence=np.zeros((n, S, 2, 2)),
+            innovations=self.innovations,
+            diverged=self.diverged,
+        )
+        scale = np.array([model.density_scale, model.speed_scale])
+        self.state.priors[..., 2:] = np.sqrt(settings.initial_variance) * scale
+        self.state.present[:] = self.state.priors
+        self.arrays = Bundle(model.road, model.arz, model.channels, stencil, self.state)
+
+    @property
+    def means(self) -> FloatArray:
+        """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
+        return self.state.present[..., :2]
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        density, speed = estimated_traffic(self.model, states)
+        self.state.priors[episodes, :, 0], self.state.priors[episodes, :, 1] = density, speed
+        restart(self.arrays, episodes)
+
+    def _estimate(self) -> Estimate:
+        return Estimate(*(self.state.present[..., j].copy() for j in range(4)))

@@ -1,4 +1,4 @@
-"""The protocol of estimators and their output.
+"""The interface of estimators and their output.
 
 An estimator follows a batch of episodes. A step is `predict` under the boundary inputs, then
 `update` by the released values, then `estimate`. Both take the indices of the episodes that they
@@ -8,13 +8,17 @@ change.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
+from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
+from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import Bundle
+from dptse_env.utils.registry import name_of_class
 
 Backend = Literal["compiled", "reference"]
 
@@ -134,13 +138,16 @@ def _full(name: str, values: Any, shape: tuple[int, ...]) -> FloatArray:
         raise ValueError(message) from problem
 
 
-class Estimator(Protocol):
-    """Estimates the traffic state of a batch of episodes, S segments each.
+class Estimator(ABC):
+    """Estimator of the traffic state of a batch of episodes, S segments each.
+
+    A subclass has `_reset`, `_predict`, `_update` and `_estimate`. It writes `innovations` and
+    `diverged` of the episodes that it updates, and `fallback` too if its update can fail.
 
     Attributes:
-        is_compiled: Whether `predict` and `update` release Python's global interpreter lock, so
-            that blocks of episodes benefit from threads.
+        model: The traffic model.
         n_episodes: Episodes n in the batch.
+        settings: Its settings, of its ``settings_type``.
         innovations: `(n, M, 2)` residuals of both releases before the last update, over their
             predicted standard deviations; 0 where nothing was observed.
         diverged: `(n,)` whether the last update found the filter non-finite or indefinite and
@@ -149,42 +156,11 @@ class Estimator(Protocol):
             prediction.
     """
 
-    is_compiled: ClassVar[bool]
-    n_episodes: int
-    innovations: FloatArray
-    diverged: BoolArray
-    fallback: BoolArray
-
-    def reset(
-        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
-    ) -> None:
-        """Reset episodes.
-
-        Args:
-            episodes: `(k,)` distinct indices.
-            states: `(k, 2 S)` prior means of the traffic; demand factors begin at 1.
-            generators: A random stream per episode, for estimators that draw.
-        """
-
-    def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        """Predict episodes `(k,)` one step ahead under the model's inputs `(k, n_u)`."""
-
-    def update(self, episodes: IntArray, measured: Measurement) -> None:
-        """Update distinct episodes `(k,)` by what was released of them."""
-
-    def estimate(self) -> Estimate:
-        """Current estimate of all episodes."""
-
-
-class BatchEstimator(ABC):
-    """Base class of the package's estimators of a batch of episodes.
-
-    Public methods are documented in `Estimator`. A subclass writes `innovations` and `diverged` of
-    the episodes that it updates, and `fallback` too if its update can fail. It has `_estimate`, or
-    `estimate` where its settings have no ``speed_cap``.
-    """
-
+    settings_type: ClassVar[type] = EstimatorSettings
+    """Dataclass of its settings."""
     is_compiled: ClassVar[bool] = False
+    """True where `predict` and `update` release Python's global interpreter lock, so that blocks of
+    episodes benefit from threads."""
     has_demand: ClassVar[bool] = True
     """True where its settings may ask for demand states."""
     steps_model: ClassVar[bool] = True
@@ -203,10 +179,40 @@ class BatchEstimator(ABC):
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
         self.fallback = np.zeros(n_episodes, dtype=np.bool_)
 
+    @staticmethod  # noqa: B027 (most refuse none)
+    def check_settings(model: ARZModel, settings: Any) -> None:
+        """Refuse settings that it cannot have on a road; it is not made.
+
+        Args:
+            model: The model, with the demand states that the settings ask for.
+            settings: The settings.
+
+        Raises:
+            ValueError: A setting is out of range on this road.
+        """
+
+    @classmethod
+    def inherits(cls, road: Road, flows: bool, largest_span: int, settings: Any) -> tuple[str, ...]:
+        """Return the settings that were made for other roads or releases than these.
+
+        Args:
+            road: The road.
+            flows: Whether flows are released, not speeds.
+            largest_span: Largest number of segments of a query.
+            settings: The settings.
+        """
+        return ()
+
     def reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
-        """See `Estimator.reset`."""
+        """Reset episodes.
+
+        Args:
+            episodes: `(k,)` distinct indices.
+            states: `(k, 2 S)` prior means of the traffic; demand factors begin at 1.
+            generators: A random stream per episode, for estimators that draw.
+        """
         shape = (len(episodes), 2 * self.model.n_segments)
         if states.shape != shape:
             raise ValueError(f"states must have shape {shape}, got {states.shape}")
@@ -219,14 +225,17 @@ class BatchEstimator(ABC):
         self._reset(episodes, states, generators)
 
     def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        """See `Estimator.predict`."""
+        """Predict episodes `(k,)` one step ahead under the model's inputs `(k, n_u)`."""
         shape = (len(episodes), self.model.n_inputs)
         if inputs.shape != shape:
             raise ValueError(f"inputs must have shape {shape}, got {inputs.shape}")
         self._predict(episodes, inputs)
 
     def update(self, episodes: IntArray, measured: Measurement) -> None:
-        """See `Estimator.update`; observed values that are not finite make a filter diverge."""
+        """Update distinct episodes `(k,)` by what was released of them.
+
+        Observed values that are not finite make a filter diverge.
+        """
         own = measured.on_road(self.model.channels.size, self.model.n_segments)
         if self._noise_scale is not None:
             observed, values, sigma, centre = own
@@ -240,10 +249,6 @@ class BatchEstimator(ABC):
             np.minimum(estimate.speed, self._largest_speed, out=estimate.speed)
         return estimate
 
-    def _estimate(self) -> Estimate:
-        """Return the estimate of all episodes in fresh arrays."""
-        raise NotImplementedError(f"{type(self).__name__} must have a method '_estimate'")
-
     @abstractmethod
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
@@ -254,3 +259,70 @@ class BatchEstimator(ABC):
 
     @abstractmethod
     def _update(self, episodes: IntArray, measured: Measurement) -> None: ...
+
+    @abstractmethod
+    def _estimate(self) -> Estimate:
+        """Return the estimate of all episodes in fresh arrays."""
+
+    def check_arrays(self) -> None:
+        """Refuse arrays of other shapes than `Estimator` has, and an estimate that is not sound.
+
+        Raises:
+            ValueError: There are such arrays; see `check_estimate`.
+        """
+        shapes = {
+            "innovations": (self.n_episodes, self.model.channels.size, 2),
+            "diverged": (self.n_episodes,),
+            "fallback": (self.n_episodes,),
+        }
+        for name, shape in shapes.items():
+            found: Any = getattr(self, name)
+            if np.shape(found) != shape:
+                raise ValueError(
+                    f"estimator {name_of_class(self)} must have an array {name!r} of shape "
+                    f"{shape}, got shape {np.shape(found)}"
+                )
+        self.check_estimate(self.estimate())
+
+    def check_estimate(self, estimate: Estimate) -> None:
+        """Refuse an estimate that is not finite or not of shape (n, S).
+
+        Estimators of this package are reset when they diverge; those of other packages may not be.
+
+        Raises:
+            ValueError: It is not.
+        """
+        shape = self.n_episodes, self.model.n_segments
+        for name in Estimate._fields:
+            values = np.asarray(getattr(estimate, name, None))
+            got = f"{values.dtype} of shape {values.shape}"
+            if values.shape == shape and values.dtype.kind == "f":
+                if np.isfinite(values).all():
+                    continue
+                episode, segment = np.argwhere(~np.isfinite(values))[0].tolist()
+                got = f"{values[episode, segment]} in episode {episode}, segment {segment}"
+            raise ValueError(
+                f"estimator {name_of_class(self)}.estimate() must return finite floats {name!r} of "
+                f"shape {shape}, got {got}"
+            )
+
+
+class KernelEstimator(Estimator):
+    """Estimator of two kernels, on arrays that they change in place.
+
+    Attributes:
+        arrays: All that the kernels read and write.
+    """
+
+    is_compiled: ClassVar[bool] = True
+    predict_kernel: ClassVar[Callable[..., None]]
+    """Kernel of the arrays, episodes and inputs; see `Estimator.predict`."""
+    update_kernel: ClassVar[Callable[..., None]]
+    """Kernel of the arrays, episodes and a `Measurement`; see `Estimator.update`."""
+    arrays: Bundle
+
+    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
+        self.predict_kernel(self.arrays, episodes, inputs)
+
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        self.update_kernel(self.arrays, episodes, measured)

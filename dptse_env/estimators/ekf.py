@@ -6,11 +6,11 @@ one inside compiled code.
 """
 
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.base import Estimate, KernelEstimator, Measurement
 from dptse_env.estimators.linalg import is_covariance, mirror, padded, pair_update, propagate
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -55,14 +55,12 @@ class Filters(NamedTuple):
     is_box: bool  # whether means are projected into the paper's box, not the cone
 
 
-class CovarianceFilter(BatchEstimator):
+class CovarianceFilter(KernelEstimator):
     """Means and covariances of all episodes as arrays for kernels.
 
     Attributes:
         filters: These arrays, which predictions and updates change in place.
     """
-
-    is_compiled: ClassVar[bool] = True
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
@@ -82,7 +80,7 @@ class CovarianceFilter(BatchEstimator):
             count_variance=count_variance(model, settings),
             is_box=settings.bounds == "box",
         )
-        self._bundle = Bundle(*model.dynamics, self.filters)
+        self.arrays = self._moments = Bundle(*model.dynamics, self.filters)
         for episode in range(n_episodes):
             restart(self.filters, episode)
 
@@ -99,7 +97,7 @@ class CovarianceFilter(BatchEstimator):
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
-        summarise(self._bundle, out)
+        summarise(self._moments, out)
         return Estimate(*out)
 
     def _reset(
@@ -112,21 +110,6 @@ class CovarianceFilter(BatchEstimator):
         """Reset episodes to their priors."""
         for episode in episodes.tolist():
             restart(self.filters, episode)
-
-
-class EKF(CovarianceFilter):
-    """Extended Kalman filter on the ARZ model: analytic Jacobians, sequential Joseph updates.
-
-    All channels of a step are linearised at its prediction, so that updating by one after the other
-    equals the joint update by all, in whichever order. Means are projected after predict and
-    update; covariances are not.
-    """
-
-    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        predict(self._bundle, episodes, inputs)
-
-    def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        update(self._bundle, episodes, measured)
 
 
 class Linearised(NamedTuple):
@@ -313,6 +296,18 @@ def summarise(bundle: Bundle, out: FloatArray) -> None:
             out[1, e, s] = clip(w - pressure(rho, jam, v_f, gamma), 0.0, LARGEST_W * v_f)
             out[2, e, s] = filters.units[i] * np.sqrt(max(covariance[i, i], 0.0))
             out[3, e, s] = np.sqrt(max(variance, 0.0))
+
+
+class EKF(CovarianceFilter):
+    """Extended Kalman filter on the ARZ model: analytic Jacobians, sequential Joseph updates.
+
+    All channels of a step are linearised at its prediction, so that updating by one after the other
+    equals the joint update by all, in whichever order. Means are projected after predict and
+    update; covariances are not.
+    """
+
+    predict_kernel = staticmethod(predict)
+    update_kernel = staticmethod(update)
 
 
 # Variances of the noise and of the prior, normalised: rho by rho_m, psi by rho_m v_f --------------

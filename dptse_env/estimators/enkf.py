@@ -7,12 +7,12 @@ and are small enough for one thread.
 """
 
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.base import Estimate, KernelEstimator, Measurement
 from dptse_env.estimators.ekf import (
     count_variance,
     find_observed,
@@ -57,101 +57,6 @@ class Ensembles(NamedTuple):
     tapers: FloatArray  # (M, n_x) weights of covariances of channels with states; (0, 0) for none
     channel_tapers: FloatArray  # (M, M) weights of covariances among channels; (0, 0) for none
     is_box: bool  # whether members are projected into the paper's box, not the cone
-
-
-class EnKF(BatchEstimator):
-    """Ensemble Kalman filter with perturbed observations (Evensen, 2003; Burgers et al., 1998).
-
-    Every member is predicted, perturbed by process noise and projected; updated by perturbed
-    measurements; and projected again. Each episode has separate streams, seeded by the generator
-    given to `reset`, for process and for measurement noise, so that the measurements do not change
-    the process noise.
-
-    Options, off by default (`EnsembleSettings`): `inflation` moves members away from their mean
-    before every update that has measurements, and projects them; `taper` weighs the sampled
-    covariances by distance, those of outputs with states and those among outputs. An S with
-    covariances that the gain neglects would give the measurements too little weight.
-
-    The noise that depends on the density (`EstimatorSettings.density_growth` and `count_noise`)
-    has the variance at the ensemble's mean for all members.
-    """
-
-    is_compiled: ClassVar[bool] = True
-
-    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
-        """See `make_estimator`."""
-        super().__init__(model, n_episodes, settings)
-        nothing = np.zeros((n_episodes, model.n_segments))
-        priors = model.project(model.compose(nothing, nothing), settings.bounds)
-        taper, none = settings.enkf.taper, np.empty((0, 0))
-        weights = Tapers(none, none) if taper is None else make_tapers(model, taper)
-        self.n_members = settings.enkf.n_members
-        self._ensembles = Ensembles(
-            members=np.repeat(priors[:, :, None], padded(self.n_members), axis=2),
-            n_members=self.n_members,
-            priors=priors,
-            streams=np.empty((n_episodes, 2, 4, STREAM_WIDTH), dtype=np.uint64),
-            innovations=self.innovations,
-            diverged=self.diverged,
-            process_deviation=np.sqrt(process_variance(model, settings)) * model.state_scale,
-            density_growth=float(settings.density_growth),
-            count_variance=count_variance(model, settings),
-            initial_deviation=np.sqrt(initial_variance(model, settings)) * model.state_scale,
-            density_scale=model.density_scale,
-            inflation=settings.enkf.inflation,
-            tapers=weights.with_states,
-            channel_tapers=weights.among_channels,
-            is_box=settings.bounds == "box",
-        )
-        self._bundle = Bundle(*model.dynamics, self._ensembles)
-        self._seed(np.arange(n_episodes), [np.random.default_rng(0)] * n_episodes)
-
-    @property
-    def members(self) -> FloatArray:
-        """Members `(n, n_members, n_x)` [veh/km, veh/h], then demand factors if any; a copy."""
-        return np.ascontiguousarray(self._inner.swapaxes(1, 2))
-
-    @property
-    def states(self) -> FloatArray:
-        """Means of the members `(n, n_x)` [veh/km, veh/h], then demand factors if any."""
-        return np.asarray(self._inner.mean(axis=2))
-
-    @property
-    def covariances(self) -> FloatArray:
-        """Sample covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f."""
-        rest = self._inner - self.states[:, :, None]
-        rest /= self.model.state_scale[:, None]
-        product = rest @ rest.swapaxes(1, 2) / (self.n_members - 1)
-        return np.asarray(0.5 * (product + product.swapaxes(1, 2)))
-
-    @property
-    def _inner(self) -> FloatArray:
-        """Members `(n, n_x, n_members)` without padding."""
-        return self._ensembles.members[:, :, : self.n_members]
-
-    def _reset(
-        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
-    ) -> None:
-        self._ensembles.priors[episodes] = self.model.project(states, self.settings.bounds)
-        self._seed(episodes, generators)
-        restart(self._bundle, episodes)
-
-    def _seed(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
-        """Seed the streams of process noise and of measurement noise."""
-        for episode, generator in zip(episodes.tolist(), generators, strict=True):
-            for kind in range(2):
-                self._ensembles.streams[episode, kind] = make_stream(generator)
-
-    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        predict(self._bundle, episodes, inputs)
-
-    def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        update(self._bundle, episodes, measured)
-
-    def _estimate(self) -> Estimate:
-        out = np.empty((4, self.n_episodes, self.model.n_segments))
-        summarise(self._bundle, out)
-        return Estimate(*out)
 
 
 # Weights of covariances ---------------------------------------------------------------------------
@@ -437,3 +342,93 @@ def is_finite(matrix: FloatArray) -> bool:
         for j in range(row.size):
             total += 0.0 * row[j]
     return total == 0.0
+
+
+class EnKF(KernelEstimator):
+    """Ensemble Kalman filter with perturbed observations (Evensen, 2003; Burgers et al., 1998).
+
+    Every member is predicted, perturbed by process noise and projected; updated by perturbed
+    measurements; and projected again. Each episode has separate streams, seeded by the generator
+    given to `reset`, for process and for measurement noise, so that the measurements do not change
+    the process noise.
+
+    Options, off by default (`EnsembleSettings`): `inflation` moves members away from their mean
+    before every update that has measurements, and projects them; `taper` weighs the sampled
+    covariances by distance, those of outputs with states and those among outputs. An S with
+    covariances that the gain neglects would give the measurements too little weight.
+
+    The noise that depends on the density (`EstimatorSettings.density_growth` and `count_noise`)
+    has the variance at the ensemble's mean for all members.
+    """
+
+    predict_kernel = staticmethod(predict)
+    update_kernel = staticmethod(update)
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        nothing = np.zeros((n_episodes, model.n_segments))
+        priors = model.project(model.compose(nothing, nothing), settings.bounds)
+        taper, none = settings.enkf.taper, np.empty((0, 0))
+        weights = Tapers(none, none) if taper is None else make_tapers(model, taper)
+        self.n_members = settings.enkf.n_members
+        self._ensembles = Ensembles(
+            members=np.repeat(priors[:, :, None], padded(self.n_members), axis=2),
+            n_members=self.n_members,
+            priors=priors,
+            streams=np.empty((n_episodes, 2, 4, STREAM_WIDTH), dtype=np.uint64),
+            innovations=self.innovations,
+            diverged=self.diverged,
+            process_deviation=np.sqrt(process_variance(model, settings)) * model.state_scale,
+            density_growth=float(settings.density_growth),
+            count_variance=count_variance(model, settings),
+            initial_deviation=np.sqrt(initial_variance(model, settings)) * model.state_scale,
+            density_scale=model.density_scale,
+            inflation=settings.enkf.inflation,
+            tapers=weights.with_states,
+            channel_tapers=weights.among_channels,
+            is_box=settings.bounds == "box",
+        )
+        self.arrays = Bundle(*model.dynamics, self._ensembles)
+        self._seed(np.arange(n_episodes), [np.random.default_rng(0)] * n_episodes)
+
+    @property
+    def members(self) -> FloatArray:
+        """Members `(n, n_members, n_x)` [veh/km, veh/h], then demand factors if any; a copy."""
+        return np.ascontiguousarray(self._inner.swapaxes(1, 2))
+
+    @property
+    def states(self) -> FloatArray:
+        """Means of the members `(n, n_x)` [veh/km, veh/h], then demand factors if any."""
+        return np.asarray(self._inner.mean(axis=2))
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Sample covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f."""
+        rest = self._inner - self.states[:, :, None]
+        rest /= self.model.state_scale[:, None]
+        product = rest @ rest.swapaxes(1, 2) / (self.n_members - 1)
+        return np.asarray(0.5 * (product + product.swapaxes(1, 2)))
+
+    @property
+    def _inner(self) -> FloatArray:
+        """Members `(n, n_x, n_members)` without padding."""
+        return self._ensembles.members[:, :, : self.n_members]
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        self._ensembles.priors[episodes] = self.model.project(states, self.settings.bounds)
+        self._seed(episodes, generators)
+        restart(self.arrays, episodes)
+
+    def _seed(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
+        """Seed the streams of process noise and of measurement noise."""
+        for episode, generator in zip(episodes.tolist(), generators, strict=True):
+            for kind in range(2):
+                self._ensembles.streams[episode, kind] = make_stream(generator)
+
+    def _estimate(self) -> Estimate:
+        out = np.empty((4, self.n_episodes, self.model.n_segments))
+        summarise(self.arrays, out)
+        return Estimate(*out)

@@ -376,11 +376,14 @@ class MHE(CovarianceFilter):
     of the last state given the window, without bounds.
     """
 
+    predict_kernel = staticmethod(predict)
+    update_kernel = staticmethod(update)
+
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings_of_mhe(settings))
         self._windows = _allocate(model, settings, self.fallback)
-        self._all = Bundle(*model.dynamics, self.filters, self._windows)
+        self.arrays = Bundle(*model.dynamics, self.filters, self._windows)
         self._restart(np.arange(n_episodes))
 
     @staticmethod
@@ -406,18 +409,12 @@ class MHE(CovarianceFilter):
         """
         n, length = self.model.n_states, int(self._windows.length[episode])
         H, q = np.empty((length, n, length, n)), np.empty((length, n))
-        write_program(self._all, episode, H, q)
+        write_program(self.arrays, episode, H, q)
         return H.reshape(length * n, length * n), q.ravel()
-
-    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        predict(self._all, episodes, inputs)
-
-    def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        update(self._all, episodes, measured)
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():
-            restart(self._all, episode)
+            restart(self.arrays, episode)
 
 
 def _allocate(model: ARZModel, settings: EstimatorSettings, fallback: BoolArray) -> Windows:

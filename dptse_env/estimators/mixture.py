@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.base import Estimate, Estimator, Measurement
 from dptse_env.estimators.recurrent import Recurrent
 from dptse_env.estimators.settings import EstimatorSettings, RecurrentSettings
 from dptse_env.model import ARZModel
@@ -17,7 +17,7 @@ from dptse_env.utils.fields import within
 LEAST_VARIANCE = 1e-12
 
 
-class Mixture(BatchEstimator):
+class Mixture(Estimator):
     """Experts on the same measurements, in a mixture that follows their likelihoods.
 
     With the density (or average density, flow or speed) y of a row, its prediction m_i by expert i
@@ -43,7 +43,7 @@ class Mixture(BatchEstimator):
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
         self._fading = 1.0 - model.time_step / settings.mixture.memory
-        self.experts: list[BatchEstimator] = [
+        self.experts: list[Estimator] = [
             kind(model, n_episodes, own) for kind, own in _experts(settings)
         ]
         self._likelihoods = np.zeros((len(self.experts), n_episodes))
@@ -59,9 +59,9 @@ class Mixture(BatchEstimator):
             with within("estimator_settings.mixture.experts: "):
                 check_settings(kind, model, own)
 
-    @staticmethod
+    @classmethod
     def inherits(
-        road: Road, flows: bool, largest_span: int, settings: EstimatorSettings
+        cls, road: Road, flows: bool, largest_span: int, settings: EstimatorSettings
     ) -> tuple[str, ...]:
         """Return the setting of the experts where no network was trained on such roads."""
         found = [
@@ -142,7 +142,7 @@ class Mixture(BatchEstimator):
         return Estimate(*means, *np.sqrt((weights[:, None] * squares).sum(axis=0)))
 
 
-def _experts(settings: EstimatorSettings) -> list[tuple[type[BatchEstimator], EstimatorSettings]]:
+def _experts(settings: EstimatorSettings) -> list[tuple[type[Estimator], EstimatorSettings]]:
     """Return the classes and settings of the experts; a name that is no estimator's is a network's.
 
     Raises:
@@ -150,7 +150,7 @@ def _experts(settings: EstimatorSettings) -> list[tuple[type[BatchEstimator], Es
     """
     from dptse_env.estimators import ESTIMATORS  # noqa: PLC0415 (which names this module)
 
-    found: list[tuple[type[BatchEstimator], EstimatorSettings]] = []
+    found: list[tuple[type[Estimator], EstimatorSettings]] = []
     for name in settings.mixture.experts:
         if name in ESTIMATORS or ":" in name:
             found.append((ESTIMATORS.find(name), settings))

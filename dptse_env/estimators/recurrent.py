@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.base import Estimate, Estimator, Measurement
 from dptse_env.estimators.recurrent_kernels import (
     CHANNELS,
     LONGEST_AGE,
@@ -44,7 +44,7 @@ SHIPPED = ("highway", "long-highway", "roads")
 _FOLDER, _SUFFIX = Path(__file__).parent / "networks", ".safetensors"
 
 
-class Recurrent(BatchEstimator):
+class Recurrent(Estimator):
     """A gated recurrent unit in every cell of the road.
 
     All cells share the weights and see the releases that cover them, the predictions of the second
@@ -83,9 +83,9 @@ class Recurrent(BatchEstimator):
         flows = model.reference_speed is not None
         network_for(settings.recurrent.weights, model.road, flows)
 
-    @staticmethod
+    @classmethod
     def inherits(
-        road: Road, flows: bool, largest_span: int, settings: EstimatorSettings
+        cls, road: Road, flows: bool, largest_span: int, settings: EstimatorSettings
     ) -> tuple[str, ...]:
         """Return the setting of the weights where they were trained on other roads or releases.
 

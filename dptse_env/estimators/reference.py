@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from scipy.linalg import LinAlgError, LinAlgWarning
 from scipy.sparse.linalg import splu
 
-from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.base import Estimate, Estimator, Measurement
 from dptse_env.estimators.ekf import count_variance, initial_variance, process_variance
 from dptse_env.estimators.enkf import make_tapers
 from dptse_env.estimators.mhe import (
@@ -166,7 +166,7 @@ class EpisodeFilter(ABC):
         return bool(np.all(variance >= 0.0) and np.all(allowed >= self.P**2))
 
 
-class ReferenceFilter(BatchEstimator):
+class ReferenceFilter(Estimator):
     """A batch of filters.
 
     Attributes:

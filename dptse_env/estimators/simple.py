@@ -5,104 +5,53 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.base import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators.base import Estimate, Estimator, KernelEstimator, Measurement
 from dptse_env.estimators.ekf import EKF
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import MEASUREMENT_FLOOR
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import Bundle, kernel
+from dptse_env.utils.kernels import Bundle, kernel, kernel_part
 
 
 class Walks(NamedTuple):
     """Scalar filters of n episodes."""
 
-    largest: FloatArray  # (S, 2) largest means [veh/km, km/h]
-    means: FloatArray  # (n, S, 2)
+    means: FloatArray  # (n, S, 2) [veh/km, km/h]
     variances: FloatArray  # (n, S, 2)
+    priors: FloatArray  # (n, S, 2) prior means
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
-
-
-class RandomWalk(BatchEstimator):
-    """Independent scalar Kalman filters on (rho, v) of each segment, without a traffic model.
-
-    Means are clipped to [0, rho_m] and [0, 1.1 v_f]. A released flow rho (v - v_0) is converted to
-    a speed by the density just estimated, which is treated as exact and at least a hundredth of
-    rho_m. A row of several segments corrects each of them by its share of the uncertainty; what it
-    says of their errors together, their covariance, is dropped.
-
-    Attributes:
-        means: Densities [veh/km] and speeds [km/h], `(n, S, 2)`.
-        variances: Of these, `(n, S, 2)`.
-    """
-
-    has_demand: ClassVar[bool] = False
-    steps_model: ClassVar[bool] = False
-
-    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
-        """See `make_estimator`."""
-        super().__init__(model, n_episodes, settings)
-        scale = np.array([model.density_scale, model.speed_scale])
-        self._process_variance = (np.array(settings.walk_noise) * scale) ** 2
-        self._initial_variance = settings.initial_variance * scale**2
-        speeds = np.full(model.n_segments, model.largest_speed)
-        self._largest = largest = np.stack([model.jam_density, speeds], axis=-1)
-        shape = (n_episodes, model.n_segments, 2)
-        self.means, self._priors = np.zeros(shape), np.zeros(shape)
-        self.variances = np.broadcast_to(self._initial_variance, shape).copy()
-        walks = Walks(largest, self.means, self.variances, self.innovations, self.diverged)
-        self._bundle = Bundle(model.channels, walks)
-
-    @property
-    def states(self) -> FloatArray:
-        """Means `(n, 2 S)` [veh/km, veh/h]."""
-        return self.model.states(self.means[..., 0], self.means[..., 1])
-
-    @property
-    def covariances(self) -> FloatArray:
-        """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f.
-
-        To first order: `traffic_jacobian` turns them into the variances of density and speed.
-        """
-        inverse = np.linalg.inv(self.model.traffic_jacobian(self.states))
-        inverse /= self.model.state_scale[:2, None]
-        blocks = inverse * self.variances[..., None, :] @ inverse.swapaxes(-1, -2)
-        n_episodes, n_segments = self.means.shape[:2]
-        joint = np.zeros((n_episodes, n_segments, 2, n_segments, 2))
-        every = np.arange(n_segments)
-        joint[:, every, :, every] = blocks.swapaxes(0, 1)
-        return joint.reshape(n_episodes, 2 * n_segments, 2 * n_segments)
-
-    def _reset(
-        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
-    ) -> None:
-        traffic = np.stack(estimated_traffic(self.model, states), axis=-1)
-        self._priors[episodes] = np.clip(traffic, 0.0, self._largest)
-        self._restart(episodes)
-
-    def _restart(self, episodes: IntArray) -> None:
-        self.means[episodes] = self._priors[episodes]
-        self.variances[episodes] = self._initial_variance
-        self.innovations[episodes] = 0.0
-
-    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        self.variances[episodes] += self._process_variance
-
-    def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        _correct(self._bundle, episodes, measured)
-        lost = episodes[self.diverged[episodes]]
-        if lost.size > 0:
-            self._restart(lost)
-
-    def _estimate(self) -> Estimate:
-        deviations = np.sqrt(self.variances)
-        columns = [table[..., i].copy() for table in (self.means, deviations) for i in range(2)]
-        return Estimate(*columns)
+    largest: FloatArray  # (S, 2) largest means
+    process_variance: FloatArray  # (2,) of a step
+    initial_variance: FloatArray  # (2,)
 
 
 @kernel
-def _correct(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
+def restart(bundle: Bundle, episodes: IntArray) -> None:
+    """Reset episodes `(k,)` to their priors."""
+    _, walks = bundle.parts
+    for e in episodes:
+        _restart(walks, e)
+
+
+@kernel_part
+def _restart(walks: Walks, e: int) -> None:
+    walks.means[e] = walks.priors[e]
+    walks.variances[e] = walks.initial_variance
+    walks.innovations[e] = 0.0
+
+
+@kernel
+def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:  # noqa: ARG001
+    """Add the variance of a step."""
+    _, walks = bundle.parts
+    for e in episodes:
+        walks.variances[e] += walks.process_variance
+
+
+@kernel
+def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
     """Update episodes `(k,)` by one channel after the other, by its density, then its other number.
 
     Either is a sum of its segments' densities or speeds, of known weights. The variances are in
@@ -141,9 +90,82 @@ def _correct(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
                     others = noise + (spread - h**2 * before)
                     mean[s, i] = min(max(mean[s, i] + gain * residual, 0.0), largest[s, i])
                     variance[s, i] = (1.0 - gain * h) ** 2 * before + gain**2 * others
+        if diverged[episodes[k]]:
+            _restart(walks, episodes[k])
 
 
-class Blend(BatchEstimator):
+class RandomWalk(KernelEstimator):
+    """Independent scalar Kalman filters on (rho, v) of each segment, without a traffic model.
+
+    Means are clipped to [0, rho_m] and [0, 1.1 v_f]. A released flow rho (v - v_0) is converted to
+    a speed by the density just estimated, which is treated as exact and at least a hundredth of
+    rho_m. A row of several segments corrects each of them by its share of the uncertainty; what it
+    says of their errors together, their covariance, is dropped.
+
+    Attributes:
+        means: Densities [veh/km] and speeds [km/h], `(n, S, 2)`.
+        variances: Of these, `(n, S, 2)`.
+    """
+
+    has_demand: ClassVar[bool] = False
+    steps_model: ClassVar[bool] = False
+    predict_kernel = staticmethod(predict)
+    update_kernel = staticmethod(update)
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        scale = np.array([model.density_scale, model.speed_scale])
+        initial_variance = settings.initial_variance * scale**2
+        speeds = np.full(model.n_segments, model.largest_speed)
+        shape = (n_episodes, model.n_segments, 2)
+        self._walks = Walks(
+            means=np.zeros(shape),
+            variances=np.broadcast_to(initial_variance, shape).copy(),
+            priors=np.zeros(shape),
+            innovations=self.innovations,
+            diverged=self.diverged,
+            largest=np.stack([model.jam_density, speeds], axis=-1),
+            process_variance=(np.array(settings.walk_noise) * scale) ** 2,
+            initial_variance=initial_variance,
+        )
+        self.means, self.variances = self._walks.means, self._walks.variances
+        self.arrays = Bundle(model.channels, self._walks)
+
+    @property
+    def states(self) -> FloatArray:
+        """Means `(n, 2 S)` [veh/km, veh/h]."""
+        return self.model.states(self.means[..., 0], self.means[..., 1])
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances `(n, 2 S, 2 S)`, rho normalised by rho_m and psi by rho_m v_f.
+
+        To first order: `traffic_jacobian` turns them into the variances of density and speed.
+        """
+        inverse = np.linalg.inv(self.model.traffic_jacobian(self.states))
+        inverse /= self.model.state_scale[:2, None]
+        blocks = inverse * self.variances[..., None, :] @ inverse.swapaxes(-1, -2)
+        n_episodes, n_segments = self.means.shape[:2]
+        joint = np.zeros((n_episodes, n_segments, 2, n_segments, 2))
+        every = np.arange(n_segments)
+        joint[:, every, :, every] = blocks.swapaxes(0, 1)
+        return joint.reshape(n_episodes, 2 * n_segments, 2 * n_segments)
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        traffic = np.stack(estimated_traffic(self.model, states), axis=-1)
+        self._walks.priors[episodes] = np.clip(traffic, 0.0, self._walks.largest)
+        restart(self.arrays, episodes)
+
+    def _estimate(self) -> Estimate:
+        deviations = np.sqrt(self.variances)
+        columns = [table[..., i].copy() for table in (self.means, deviations) for i in range(2)]
+        return Estimate(*columns)
+
+
+class Blend(Estimator):
     """An EKF and a random walk on the same measurements, and the weighted mean of what they report.
 
     With x_1 the EKF's density (or speed), x_2 the walk's and c the weight of `BlendSettings`, the
@@ -220,7 +242,7 @@ def _mean(weight: float, one: FloatArray, other: FloatArray) -> FloatArray:
     return weight * one + (1.0 - weight) * other
 
 
-class OpenLoop(BatchEstimator):
+class OpenLoop(Estimator):
     """Predictions of the model from the prior; measurements are ignored.
 
     Standard deviations and innovations are zero. An episode whose state has become non-finite is

@@ -65,45 +65,6 @@ class Points(NamedTuple):
     spread: float  # points are the mean plus and minus spread times columns of a root of P
 
 
-class UKF(CovarianceFilter):
-    """Unscented Kalman filter (Wan and van der Merwe, 2000), the paper's weights.
-
-    Points are made once per step, predicted and projected; mean, covariance and measurements are
-    all computed from these points, without new ones for the update. Means are also projected after
-    predict and update.
-    """
-
-    @staticmethod
-    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
-        """Refuse points that the model's number of states does not allow."""
-        n, kappa = model.n_states, settings.ukf.kappa
-        require(n + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n}", kappa)
-
-    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
-        """See `make_estimator`."""
-        super().__init__(model, n_episodes, settings)
-        alpha, beta, n = settings.ukf.alpha, settings.ukf.beta, model.n_states
-        spread = alpha**2 * (n + settings.ukf.kappa)
-        self._points = Points(
-            states=np.zeros((n_episodes, n, padded(2 * n + 1))),
-            moved=np.zeros(n_episodes, dtype=np.bool_),
-            weight=0.5 / spread,
-            surplus=beta - alpha**2,
-            spread=float(np.sqrt(spread)),
-        )
-        self._all = Bundle(*model.dynamics, self.filters, self._points)
-
-    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        predict(self._all, episodes, inputs)
-
-    def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        update(self._all, episodes, measured)
-
-    def _restart(self, episodes: IntArray) -> None:
-        self._points.moved[episodes] = False
-        super()._restart(episodes)
-
-
 @kernel
 def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict one step ahead under inputs `(k, n_u)` by points that are made, moved, projected."""
@@ -287,3 +248,39 @@ def _measure(
             counted += filters.means[e, 2 * s]
         noise[2 * r] += filters.count_variance[m] * counted / channels.span[m] ** 2
     return noise
+
+
+class UKF(CovarianceFilter):
+    """Unscented Kalman filter (Wan and van der Merwe, 2000), the paper's weights.
+
+    Points are made once per step, predicted and projected; mean, covariance and measurements are
+    all computed from these points, without new ones for the update. Means are also projected after
+    predict and update.
+    """
+
+    predict_kernel = staticmethod(predict)
+    update_kernel = staticmethod(update)
+
+    @staticmethod
+    def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
+        """Refuse points that the model's number of states does not allow."""
+        n, kappa = model.n_states, settings.ukf.kappa
+        require(n + kappa > 0.0, "estimator_settings.ukf.kappa", f"> -{n}", kappa)
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        alpha, beta, n = settings.ukf.alpha, settings.ukf.beta, model.n_states
+        spread = alpha**2 * (n + settings.ukf.kappa)
+        self._points = Points(
+            states=np.zeros((n_episodes, n, padded(2 * n + 1))),
+            moved=np.zeros(n_episodes, dtype=np.bool_),
+            weight=0.5 / spread,
+            surplus=beta - alpha**2,
+            spread=float(np.sqrt(spread)),
+        )
+        self.arrays = Bundle(*model.dynamics, self.filters, self._points)
+
+    def _restart(self, episodes: IntArray) -> None:
+        self._points.moved[episodes] = False
+        super()._restart(episodes)

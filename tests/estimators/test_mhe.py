@@ -207,7 +207,7 @@ def failing(problem, **_):
 def make_unsolvable(mhe, monkeypatch):
     """Bounds that no state is within, so that no trajectory passes for an optimum."""
     nowhere = mhe._windows._replace(lower=mhe._windows.upper + 1.0)
-    monkeypatch.setattr(mhe, "_all", Bundle(*mhe.model.dynamics, mhe.filters, nowhere))
+    monkeypatch.setattr(mhe, "arrays", Bundle(*mhe.model.dynamics, mhe.filters, nowhere))
 
 
 @pytest.mark.parametrize("solver", [None, lying, mad, silent, failing])

@@ -109,7 +109,7 @@ def test_every_name_and_backend_follows_the_protocol(name, backend):
 
 def test_unknown_names_say_what_is_allowed():
     for name, backend, n, message in (
-        ("kf", "compiled", 1, r"estimator must be one of ekf, .*, mixture, or .*, got 'kf'"),
+        ("kf", "compiled", 1, r"estimator must be one of ekf, .*, mixture, or.*, got 'kf'"),
         ("ekf", "torch", 1, "backend must be one of compiled, reference, got 'torch'"),
         ("ekf", "compiled", 0, "n_episodes must be >= 1, got 0"),
     ):

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from gymnasium import spaces
 
-from dptse_env.estimators import BatchEstimator, Estimate, Measurement
+from dptse_env.estimators import Estimate, Estimator, Measurement
 from dptse_env.release import PrivacyReport, PrivacySettings, ReleaseModel
 from dptse_env.schedules import Schedule
 from dptse_env.spaces.actions import ActionEncoding, Decision
@@ -29,7 +29,7 @@ class SmoothedSettings:
         checked_fields(self, "estimator_settings")
 
 
-class Smoothed(BatchEstimator):
+class Smoothed(Estimator):
     """Exponential smoothing of releases of mean speeds; it does not read centred flows."""
 
     settings_type = SmoothedSettings
@@ -50,7 +50,7 @@ class Smoothed(BatchEstimator):
         after = (1.0 - weight) * before + weight * measured.values
         self.traffic[episodes] = np.where(measured.observed[:, :, None], after, before)
 
-    def estimate(self) -> Estimate:
+    def _estimate(self) -> Estimate:
         density, speed = self.traffic[..., 0].copy(), self.traffic[..., 1].copy()
         return Estimate(density, speed, np.full_like(density, 20.0), np.full_like(speed, 10.0))
 
