@@ -8,13 +8,12 @@ and parsed afterwards, so that a row with a malformed number is kept and can be 
 from __future__ import annotations
 
 import csv
-import gzip
 import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any, NamedTuple, cast
+from typing import Any, NamedTuple
 from xml.parsers import expat
 
 import polars as pl
@@ -22,6 +21,7 @@ from polars.io.plugins import register_io_source
 
 from dptse_env.importers.source import LABELS, NUMBERS, Source, TrajectoryError
 from dptse_env.utils.fields import cut, shown
+from dptse_env.utils.files import open_unzipped
 
 SCHEMA = {
     "row": pl.Int64,
@@ -191,7 +191,7 @@ def _raw(path: Path, form: Format) -> _Raw:
 
 
 def _text(path: Path, form: Format) -> _Raw:
-    with _open(path) as file:
+    with open_unzipped(path) as file:
         text = file.read(HEAD).decode("utf-8-sig", errors="replace")
     if "\0" in text:
         raise TrajectoryError(f"{path}: it must be text in UTF-8, got bytes of 0, as in UTF-16")
@@ -261,10 +261,6 @@ def _count_rows(path: Path, separator: str | None, n: int) -> int:
             f"{path}, row {row}: it must have {n} fields, got {fields or 'an open quote'}"
         )
     return int(rows)
-
-
-def _open(path: Path) -> IO[bytes]:
-    return cast(IO[bytes], gzip.open(path)) if path.suffix.lower() == ".gz" else path.open("rb")
 
 
 def _number(kind: Any, name: str, grouped: bool) -> pl.Expr:
@@ -387,7 +383,7 @@ def _xml(path: Path, form: Format) -> Iterator[pl.DataFrame]:
 
     parser.StartElementHandler = start
     try:
-        with _open(path) as file:
+        with open_unzipped(path) as file:
             while block := file.read(BLOCK):
                 parser.Parse(block, False)
                 if len(rows) >= CHUNK:
@@ -407,7 +403,7 @@ def _xml(path: Path, form: Format) -> Iterator[pl.DataFrame]:
 
 def _json(path: Path, form: Format) -> pl.LazyFrame:
     """Return the points of a JSON array with a document for each vehicle; a row is a document."""
-    with _open(path) as file:
+    with open_unzipped(path) as file:
         content = file.read(LARGEST_JSON + 1)
     if len(content) > LARGEST_JSON:
         raise TrajectoryError(

@@ -18,12 +18,12 @@ from math import inf
 from operator import itemgetter
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any
+from typing import Annotated
 from xml.etree import ElementTree
 
 from dptse_env.traffic.demand import Incident, lowest_limit
 from dptse_env.utils.fields import Interval, checked_fields, require, shown
-from dptse_env.utils.files import file_digest
+from dptse_env.utils.files import file_digest, open_unzipped
 
 Position = Annotated[float, Interval(0, 1e6)]
 """Place on an edge, from its start [m]."""
@@ -415,7 +415,7 @@ def copy_input(path: Path, copy: Path, begin: float) -> Copied:
     parts: list[tuple[float, str]] = []
     found, last, depth = Copied(), -inf, 0
     try:
-        with open_xml(path) as file:
+        with open_unzipped(path) as file:
             for event, element in ElementTree.iterparse(file, events=("start", "end")):
                 depth += 1 if event == "start" else -1
                 if event == "start" and depth == 1:
@@ -513,10 +513,3 @@ def clock(text: str) -> float:
     if len(parts) not in weights:
         raise ValueError(f"must be seconds or hh:mm:ss, got {shown(text)}")
     return sum(w * part for w, part in zip(weights[len(parts)], parts, strict=True)) + rest
-
-
-def open_xml(path: Path) -> Any:
-    """Open a file, plain or gzipped, for reading bytes."""
-    with path.open("rb") as file:
-        zipped = file.read(2) == b"\x1f\x8b"
-    return gzip.open(path) if zipped else path.open("rb")

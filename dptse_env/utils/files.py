@@ -7,6 +7,7 @@ they are in memory. Their card, what one should know of the arrays, stands in th
 
 import contextlib
 import glob
+import gzip
 import hashlib
 import json
 import os
@@ -16,7 +17,7 @@ import time
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -344,3 +345,10 @@ def json_digest(content: Any) -> str:
         TypeError: A value is not plain.
     """
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def open_unzipped(path: Path) -> IO[bytes]:
+    """Open a file, plain or gzipped, for reading its plain bytes."""
+    with path.open("rb") as file:
+        zipped = file.read(2) == b"\x1f\x8b"
+    return cast(IO[bytes], gzip.open(path)) if zipped else path.open("rb")

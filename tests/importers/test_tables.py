@@ -264,7 +264,10 @@ BAD = {
         (",".join(f"c{i}" for i in range(10_000)), "source.columns.time must be"),
         (None, "the file cannot be read: No such file"),
     ],
-    "a.csv.gz": [("not compressed", "the file cannot be read: Not a gzipped file")],
+    "a.csv.gz": [
+        ("not compressed", r"source\.columns\.time must be a column of the file, got 't'"),
+        (gzip.compress(b"t,id,s,v" * 99)[:-9], "the file cannot be read: Compressed file ended"),
+    ],
     "a.parquet": [("PAR1 and no more", "it is no complete Parquet file")],
     "a.json": [
         (json.dumps(i24(stream()))[:-2000], "JSON must be a complete array of documents, .*Syntax"),

@@ -8,8 +8,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from dptse_env.importers.sumo_net.net import root_of
-from dptse_env.traffic.own_sumo import TRAFFIC, UNREADABLE, clock, copy_input, open_xml
+from dptse_env.traffic.own_sumo import TRAFFIC, UNREADABLE, clock, copy_input
 from dptse_env.utils.fields import shown, within
+from dptse_env.utils.files import open_unzipped
 
 SHORT = {
     "n": "net-file", "net": "net-file",
@@ -106,7 +107,7 @@ def read_configuration(path: Path) -> Files:
     if "onfiguration" not in root.tag:
         raise ValueError(f"{where} must be a <configuration> of SUMO, got <{root.tag:.60}>")
     try:
-        with open_xml(path) as file:
+        with open_unzipped(path) as file:
             elements = list(ElementTree.parse(file).iter())
     except UNREADABLE as error:
         raise ValueError(f"{where} must be XML: {error!s:.200}") from error

@@ -10,8 +10,9 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.sax import SAXException
 
-from dptse_env.traffic.own_sumo import UNREADABLE, open_xml
+from dptse_env.traffic.own_sumo import UNREADABLE
 from dptse_env.utils.fields import shown
+from dptse_env.utils.files import open_unzipped
 
 NEWEST_VERSION = (1, 20)
 """Newest version of net files that the supported release of SUMO reads."""
@@ -178,7 +179,7 @@ def root_of(path: Path, where: str) -> ElementTree.Element:
     if path.is_dir():
         raise ValueError(f"{where}: {path} must be a file, got a folder")
     try:
-        with open_xml(path) as file:
+        with open_unzipped(path) as file:
             root: ElementTree.Element = next(ElementTree.iterparse(file, events=("start",)))[1]
             return root
     except UNREADABLE as error:
