@@ -70,12 +70,16 @@ class SavedPolicy:
 
     Attributes:
         source: The file, or the name of a policy that comes with the package.
-        identity: Digest that tells policies apart whatever their files are called.
+        card: Description of the policy, see `dptse_env.policies.PolicyFile`.
     """
 
     source: str
-    identity: str
     card: Mapping[str, Any]
+
+    @property
+    def identity(self) -> str:
+        """Digest that tells policies apart whatever their files are called."""
+        return str(self.card["sha256"])
 
     @property
     def keywords(self) -> dict[str, Any]:
@@ -118,9 +122,11 @@ class SavedPolicy:
         """
         from dptse_env.sb3 import load_policy  # noqa: PLC0415
 
-        present, known = (card["sha256"] for card in (read_policy(self.source).card, self.card))
-        if present != known:
-            raise ValueError(f"{self.source!r} has changed: sha256 {present}, it was {known}")
+        present = read_policy(self.source).identity
+        if present != self.identity:
+            raise ValueError(
+                f"{self.source!r} has changed: sha256 {present}, it was {self.identity}"
+            )
         policy: Policy = load_policy(self.source, env, allow=allow)
         return policy
 
@@ -163,7 +169,7 @@ def read_saved_policy(source: str | Path) -> SavedPolicy:
         ValueError: The file is not a saved policy.
     """
     file = read_policy(source)
-    saved = SavedPolicy(file.source, file.identity, file.card)
+    saved = SavedPolicy(file.source, file.card)
     try:
         # The entries of the card that the properties rely on must be there.
         _ = saved.recipe, saved.training_seed

@@ -69,13 +69,6 @@ class History:
         scale = corridor.density_scale
         return cls(episode, config.horizon_steps, lengths, scale, title=title)
 
-    @classmethod
-    def from_process(cls, process: QueryProcess, episode: int = 0) -> History:
-        """Start a history with the present state of an episode of ``process``."""
-        history = cls.empty(process, episode)
-        history.append(process)
-        return history
-
     @property
     def road_length(self) -> float:
         """Length of the mainline [km]."""
@@ -232,7 +225,8 @@ class Drawing:
 
     def begin(self, process: QueryProcess) -> None:
         """Take up an episode that was just reset."""
-        self.history, self._frame = History.from_process(process, self.episode), None
+        self.history, self._frame = History.empty(process, self.episode), None
+        self.history.append(process)
         if self.screen is not None:
             self.screen.reopen()
             self.screen.show(self.draw())

@@ -30,7 +30,6 @@ from agents.training.run_files import (
 )
 from agents.training.settings import TrainingPlan
 from dptse_env.evaluation import evaluate
-from dptse_env.parts import make_interface
 from dptse_env.sb3 import ActingPolicy, save_policy
 from dptse_env.traffic import Records
 from dptse_env.utils.fields import read_json, require
@@ -224,7 +223,7 @@ class Run:
         deterministic: bool,
         scaled: VecNormalize | None,
     ) -> float:
-        acting = ActingPolicy(policy, make_interface(env.config), normalisation=scaled)
+        acting = ActingPolicy(policy, env.interface, normalisation=scaled)
         seeds, noise = self.plan.validation_seeds, TRAINING_VALIDATION.start
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(noise)
