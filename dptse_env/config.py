@@ -19,7 +19,7 @@ from dptse_env.estimators import (
     checked_settings,
     settings_type,
 )
-from dptse_env.estimators.settings import (
+from dptse_env.estimators.tuned import (
     read_settings,
     tuned_estimator,
     tuned_settings,

@@ -38,7 +38,7 @@ from agents.play import record
 from agents.study import Place
 from agents.tables import ERROR, Labels, values
 from dptse_env.estimators import check_estimator
-from dptse_env.estimators.settings import DEFAULT_PARAMETERS, tuned_with
+from dptse_env.estimators.tuned import DEFAULT_PARAMETERS, tuned_with
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.parameters import read_parameters, write_parameters
 from dptse_env.schedules import SCHEDULES

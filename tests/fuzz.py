@@ -42,7 +42,7 @@ from agents.policies import find_policy
 from dptse_env import config
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS, settings_type
-from dptse_env.estimators.settings import available_settings, load_settings, write_settings
+from dptse_env.estimators.tuned import available_settings, load_settings, write_settings
 from dptse_env.importers import Layout, Source, import_trajectories
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import Split

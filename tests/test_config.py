@@ -18,7 +18,7 @@ from dptse_env.config import (
     resolve,
 )
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
-from dptse_env.estimators.settings import available_settings, load_settings
+from dptse_env.estimators.tuned import available_settings, load_settings
 from dptse_env.parts import make_release, make_task, privacy_report, warn_where_void
 from dptse_env.release import MOST_OPTIONS, RELEASE_MODELS, CappedSettings, PrivacySettings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution

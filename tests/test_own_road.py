@@ -12,7 +12,7 @@ import pytest
 from dptse_env.config import resolve
 from dptse_env.estimators import ESTIMATORS, EstimatorSettings
 from dptse_env.estimators.ekf import count_variance
-from dptse_env.estimators.settings import load_settings, write_settings
+from dptse_env.estimators.tuned import load_settings, write_settings
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.model.parameters import write_parameters
 from dptse_env.release import RELEASE_MODELS

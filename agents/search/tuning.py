@@ -46,7 +46,7 @@ from agents.search.space import (
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, EnvConfig, parse_seeds
 from dptse_env.estimators import EstimatorSettings
-from dptse_env.estimators.settings import settings_name, write_settings
+from dptse_env.estimators.tuned import settings_name, write_settings
 from dptse_env.evaluation import Row
 from dptse_env.traffic import Records
 from dptse_env.utils.fields import from_mapping, require

@@ -14,8 +14,8 @@ from dptse_env.estimators.settings import (
     MixtureSettings,
     RecurrentSettings,
     SigmaPointSettings,
-    load_settings,
 )
+from dptse_env.estimators.tuned import load_settings
 from dptse_env.model import ARZModel
 from dptse_env.utils.fields import shown
 from dptse_env.utils.registry import Registry, is_foreign

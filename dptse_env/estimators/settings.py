@@ -1,39 +1,19 @@
-"""Settings of the estimators: frozen dataclasses, the tuned ones, and which an environment gets.
+"""Settings of the estimators: frozen dataclasses, checked when they are made.
 
-``tuned.json`` has a table by name: ``<estimator>-<ARZ parameters>-<privacy preset>``, and for those
-of a road or another variant that with its name at the end. ``dptse tune`` writes a file with
-one such entry, which the keyword ``estimator_settings`` takes. What an entry leaves out has the
-value of `EstimatorSettings`.
+They are in one file: those of all filters are fields of `EstimatorSettings`, which every filter
+takes, and a configuration checks them before it imports any.
 """
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.resources import files
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from dptse_env.model import ARZParameters, Bounds, available_parameters, load_parameters
-from dptse_env.utils.fields import (
-    Interval,
-    check_object,
-    checked_fields,
-    cut,
-    from_mapping,
-    read_json,
-    shown,
-    within,
-)
+from dptse_env.model import Bounds
+from dptse_env.utils.fields import Interval, checked_fields, shown
 
 Linearisation = Literal["paper", "trajectory"]
 
-_PATH = "estimator_settings"
-_KEYS = {"estimator": str, "settings": dict, "provenance": dict}
-
-DEFAULT_PARAMETERS = "w99-3lane"
-"""ARZ parameters whose tuned settings hold for parameters that do not say what they come from:
-those fitted to simulated traffic, which predict it about as well as others that are fitted."""
+PATH = "estimator_settings"
+"""Their place in error messages."""
 
 Deviation = Annotated[float, Interval(0, 10)]
 """A standard deviation in units of rho_m or v_f."""
@@ -62,7 +42,7 @@ class _Checked:
 
 
 @dataclass(frozen=True)
-class SigmaPointSettings(_Checked, path=f"{_PATH}.ukf"):
+class SigmaPointSettings(_Checked, path=f"{PATH}.ukf"):
     """Sigma points of the unscented Kalman filter (van der Merwe, 2004), with the paper's values.
 
     Attributes:
@@ -77,7 +57,7 @@ class SigmaPointSettings(_Checked, path=f"{_PATH}.ukf"):
 
 
 @dataclass(frozen=True)
-class EnsembleSettings(_Checked, path=f"{_PATH}.enkf"):
+class EnsembleSettings(_Checked, path=f"{PATH}.enkf"):
     """Settings of the ensemble Kalman filter beside `EstimatorSettings`.
 
     Attributes:
@@ -94,7 +74,7 @@ class EnsembleSettings(_Checked, path=f"{_PATH}.enkf"):
 
 
 @dataclass(frozen=True)
-class HorizonSettings(_Checked, path=f"{_PATH}.mhe"):
+class HorizonSettings(_Checked, path=f"{PATH}.mhe"):
     """Settings of the moving horizon estimator beside `EstimatorSettings`.
 
     The weights of the paper's objective (eq. 14) are inverse variances, so that H is the inverse
@@ -120,7 +100,7 @@ class HorizonSettings(_Checked, path=f"{_PATH}.mhe"):
 
 
 @dataclass(frozen=True)
-class RecurrentSettings(_Checked, path=f"{_PATH}.recurrent"):
+class RecurrentSettings(_Checked, path=f"{PATH}.recurrent"):
     """Settings of the recurrent network.
 
     Attributes:
@@ -136,7 +116,7 @@ class RecurrentSettings(_Checked, path=f"{_PATH}.recurrent"):
 
 
 @dataclass(frozen=True)
-class DemandSettings(_Checked, path=f"{_PATH}.demand"):
+class DemandSettings(_Checked, path=f"{PATH}.demand"):
     """Settings of demand states: factors on the demands at the entries, estimated as well.
 
     A factor begins at 1 and follows a random walk.
@@ -151,7 +131,7 @@ class DemandSettings(_Checked, path=f"{_PATH}.demand"):
 
 
 @dataclass(frozen=True)
-class BlendSettings(_Checked, path=f"{_PATH}.blend"):
+class BlendSettings(_Checked, path=f"{PATH}.blend"):
     """Settings of the blend of an EKF and a random walk beside `EstimatorSettings`.
 
     Attributes:
@@ -164,7 +144,7 @@ class BlendSettings(_Checked, path=f"{_PATH}.blend"):
 
 
 @dataclass(frozen=True)
-class AdaptiveSmoothingSettings(_Checked, path=f"{_PATH}.asm"):
+class AdaptiveSmoothingSettings(_Checked, path=f"{PATH}.asm"):
     """Constants of adaptive smoothing (Treiber and Helbing, 2002), the same for all quantities.
 
     Attributes:
@@ -188,7 +168,7 @@ class AdaptiveSmoothingSettings(_Checked, path=f"{_PATH}.asm"):
 
 
 @dataclass(frozen=True)
-class MixtureSettings(_Checked, path=f"{_PATH}.mixture"):
+class MixtureSettings(_Checked, path=f"{PATH}.mixture"):
     """Settings of the mixture.
 
     Attributes:
@@ -205,13 +185,13 @@ class MixtureSettings(_Checked, path=f"{_PATH}.mixture"):
         super().__post_init__()
         if len(self.experts) < 2 or "mixture" in self.experts:
             raise ValueError(
-                f"{_PATH}.mixture.experts must be two or more names of other estimators or of "
+                f"{PATH}.mixture.experts must be two or more names of other estimators or of "
                 f"networks, got {shown(self.experts)}"
             )
 
 
 @dataclass(frozen=True)
-class EstimatorSettings(_Checked, path=_PATH):
+class EstimatorSettings(_Checked, path=PATH):
     """Tuning of the estimators, in units of the jam density rho_m and of v_f.
 
     Attributes:
@@ -259,121 +239,3 @@ class EstimatorSettings(_Checked, path=_PATH):
     recurrent: RecurrentSettings = field(default_factory=RecurrentSettings)
     asm: AdaptiveSmoothingSettings = field(default_factory=AdaptiveSmoothingSettings)
     mixture: MixtureSettings = field(default_factory=MixtureSettings)
-
-
-def tuned_settings(
-    estimator: Any, parameters: ARZParameters, preset: Any, variant: str = ""
-) -> str | None:
-    """Return the name of the shipped settings that an environment gets unless it names others.
-
-    Those of a variant come before those without. Parameters of one's own get those of the shipped
-    set that `tuned_with` names.
-
-    Args:
-        estimator: Name of the estimator, or a part of another package, which has none.
-        parameters: The ARZ parameters of its model.
-        preset: The privacy preset, or a part of another package, which has none.
-        variant: Name of the road, where there may be settings for it alone.
-
-    Returns:
-        The name; None where none ship, so that the defaults of the estimator's settings hold.
-    """
-    if not isinstance(estimator, str) or not isinstance(preset, str):
-        return None
-    names = [settings_name(estimator, tuned_with(parameters), preset, v) for v in (variant, "")]
-    return next((name for name in names if name in _table()), None)
-
-
-def tuned_with(parameters: ARZParameters) -> str:
-    """Return the name of the shipped ARZ parameters whose tuned settings hold for these."""
-    if parameters in map(load_parameters, available_parameters()):
-        return parameters.name
-    return parameters.derived_from or DEFAULT_PARAMETERS
-
-
-def settings_name(estimator: str, parameters: str, privacy: str, variant: str = "") -> str:
-    """Return the name of tuned settings."""
-    return "-".join((estimator, parameters, privacy, *((variant,) if variant else ())))
-
-
-def available_settings() -> tuple[str, ...]:
-    """Names of the tuned settings that ship with the package, sorted."""
-    return tuple(sorted(_table()))
-
-
-@cache
-def load_settings(name: str) -> EstimatorSettings:
-    """Load tuned settings that ship with the package.
-
-    Raises:
-        ValueError: There are none of this name; the message lists the available ones.
-    """
-    if name not in _table():
-        known = ", ".join(available_settings())
-        raise ValueError(f"{_PATH} must be one of {known}, got {shown(name)}")
-    return _parse(_table()[name], name)
-
-
-def read_settings(path: str | Path) -> EstimatorSettings:
-    """Read tuned settings from a JSON file, as written by `write_settings`.
-
-    Raises:
-        ValueError: The file cannot be read, has another format, or a setting is out of range; the
-            message starts with the path of the file.
-    """
-    return _parse(_entry(read_json(path), str(path)), str(path))
-
-
-def tuned_estimator(path: str | Path) -> str:
-    """Return the estimator that the settings in a JSON file were tuned for.
-
-    Raises:
-        ValueError: The file cannot be read, or has another format.
-    """
-    return str(_entry(read_json(path), str(path))["estimator"])
-
-
-def write_settings(
-    path: str | Path,
-    *,
-    estimator: str,
-    parameters: str,
-    privacy: str,
-    settings: Mapping[str, Any],
-    provenance: Mapping[str, Any],
-    variant: str = "",
-) -> None:
-    """Write tuned fields of `EstimatorSettings` and how they were tuned as JSON.
-
-    Raises:
-        ValueError: A setting is unknown or out of range; nothing is written then.
-    """
-    entry = {
-        "estimator": estimator, "settings": dict(settings), "provenance": dict(provenance),
-    }  # fmt: skip
-    name = settings_name(estimator, parameters, privacy, variant)
-    text = json.dumps({name: entry}, indent=2) + "\n"
-    _parse(_entry(json.loads(text), str(path)), str(path))
-    Path(path).write_text(text, encoding="utf-8")
-
-
-@cache
-def _table() -> dict[str, dict[str, Any]]:
-    text = (files(__package__) / "tuned.json").read_text(encoding="utf-8")
-    table: dict[str, dict[str, Any]] = json.loads(text)
-    return table
-
-
-def _entry(content: Any, path: str) -> dict[str, Any]:
-    """Return the entry of a file that has one."""
-    if not isinstance(content, dict) or len(content) != 1:
-        raise ValueError(
-            f"{path} must be a mapping with one name of settings, got {shown(content)}"
-        )
-    ((name, entry),) = content.items()
-    return check_object(entry, f"{path}: {cut(name)}", _KEYS)
-
-
-def _parse(entry: Mapping[str, Any], path: str) -> EstimatorSettings:
-    with within(f"{path}: "):
-        return from_mapping(EstimatorSettings, entry["settings"], _PATH)

@@ -20,7 +20,7 @@ from agents.search.space import (
 )
 from agents.search.tuning import BATCH, Search, chosen, journal_path, n_finished, tune, write
 from dptse_env.estimators import ESTIMATORS, EstimatorSettings
-from dptse_env.estimators.settings import available_settings, load_settings, read_settings
+from dptse_env.estimators.tuned import available_settings, load_settings, read_settings
 from dptse_env.evaluation import evaluate
 from dptse_env.utils.fields import from_mapping
 from tests.helpers import SHORT, save_untrained

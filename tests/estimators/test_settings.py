@@ -15,6 +15,8 @@ from dptse_env.estimators.settings import (
     EstimatorSettings,
     HorizonSettings,
     SigmaPointSettings,
+)
+from dptse_env.estimators.tuned import (
     available_settings,
     load_settings,
     read_settings,
