@@ -80,12 +80,12 @@ class Parts:
         config: The configuration.
         interface: Action encoding, observation and reward.
         traffic: The true traffic.
-        release: What leaves the road.
+        release: The release model, which makes all data that leaves the road.
         model: The traffic model of the estimator and the boundary.
         boundary: The model's inputs at the road's ends and ramps.
         estimator: The estimator.
         detectors: Errors of the fixed sensors; None where they have none.
-        fusion: What turns releases into measurements of all vehicles; None where they are.
+        fusion: Turns releases into measurements of all vehicles; None where they are.
     """
 
     config: EnvConfig

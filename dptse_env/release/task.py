@@ -90,7 +90,7 @@ class Task:
         group = np.where(np.arange(first.size) < queries.n_options, 0, len(self.groups) - 1)
         return Channels(first, span, group, road.lengths[first] * span)
 
-    @property
+    @cached_property
     def n_channels(self) -> int:
         """Channels C."""
         return self.channels.size
@@ -101,7 +101,7 @@ class Task:
         road = self.corridor.road
         return road.n_segments + (road.beside.size if self.settings.boundary == "private" else 0)
 
-    @property
+    @cached_property
     def n_on_road(self) -> int:
         """Channels M on the road, the first ones, which estimators are given."""
         return self.n_channels - (self.n_cells - self.corridor.road.n_segments)

@@ -54,7 +54,7 @@ class Kind:
     """A class of policies that can be saved.
 
     Attributes:
-        module: Where it is.
+        module: The module that defines it.
         actions: Encodings of actions that it can have; none for all.
         sizes: Its arguments beside the layers and the units of a perceptron.
         actor: Beginnings of the names of weights that actions depend on, and that are saved.
@@ -117,8 +117,8 @@ def save_policy(
         keywords: Keywords of that environment, plain JSON.
         training: Recipe, seeds, steps; plain JSON.
         figures: Results, by name; plain JSON.
-        normalisation: What scaled its observations in the training. Its statistics travel in the
-            file, and are applied wherever the policy acts.
+        normalisation: The wrapper that scaled its observations in the training. Its statistics
+            travel in the file, and are applied wherever the policy acts.
         deterministic: Whether it is to take its likeliest action, or to draw actions.
 
     Raises:

@@ -56,7 +56,7 @@ class PendingPicks:
         Args:
             episodes: Shape (k,).
             wanted: Shape (k, n).
-            limit: What the kept options of an episode may cost together, shape (k,).
+            limit: Largest total cost of the kept options of an episode, shape (k,).
             costs: Of the options, at least 1 each, shape (n,).
         """
         kept = np.zeros_like(wanted)
@@ -96,7 +96,7 @@ def first_that_fit(order: IntArray, costs: IntArray, limit: int) -> BoolArray:
     Args:
         order: The options, best first, shape (k, n).
         costs: Of the options, shape (n,).
-        limit: What they may cost together.
+        limit: Their largest total cost.
     """
     kept, every = np.zeros(order.shape, dtype=bool), np.arange(len(order))
     if (costs == costs[0]).all():
