@@ -148,7 +148,8 @@ def convert(hint: Any, value: Any, path: str, base: Any = None) -> Any:
         keep = base if isinstance(base, typing.cast(type, kind)) else None
         return from_mapping(typing.cast(type, kind), value, path, keep)
     if origin is typing.Literal:
-        return _choice(items, value, path)
+        require_name(path, value, items)
+        return value
     if origin is tuple:
         return _convert_tuple(items, value, path)
     if (isinstance(value, bool) and kind is not bool) or not isinstance(value, kind):
@@ -195,14 +196,6 @@ def allowed_numbers(kind: type, interval: Interval | None) -> str:
         return f"an integer >= {interval.low:.0f}"
     finite = "finite " if interval.high == math.inf and interval.open_high else ""
     return f"a {finite}number {interval}"
-
-
-def _choice(allowed: tuple[Any, ...], value: Any, path: str) -> Any:
-    # Membership by type first: an array compares element by element.
-    if not isinstance(value, str | int | float | None) or value not in allowed:
-        names = ", ".join(map(repr, allowed))
-        raise ValueError(f"{path} must be one of {names}, got {shown(value)}")
-    return value
 
 
 def _convert_tuple(items: tuple[Any, ...], value: Any, path: str) -> tuple[Any, ...]:

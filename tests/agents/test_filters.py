@@ -232,9 +232,9 @@ LONGER = f'{SHORT} {{"corridor": {{"n_mainline": 9}}}}'
 def test_a_batch_mixes_scenarios_of_any_roads():
     """Releases of speeds and of flows, of single cells and of sums, on two roads."""
     singles, sums = collect(mixed("paper"), WALK, None), collect(mixed("paced", LONGER), WALK, None)
-    assert singles.cells.lanes.size + 3 == sums.cells.lanes.size
+    assert len(singles.cells.fixed) + 3 == len(sums.cells.fixed)
     batch = Batch([singles.pick(np.array([1])), sums.pick(np.array([0, 1]))])
-    n = singles.cells.lanes.size
+    n = len(singles.cells.fixed)
     np.testing.assert_array_equal(batch.truth[:, :n], singles.truth[:, 1])
     network = RecurrentNetwork(4)
     alone = [
@@ -248,7 +248,7 @@ def test_a_batch_mixes_scenarios_of_any_roads():
 def test_batches_are_drawn_from_all_scenarios():
     collected = [collect(mixed("paper"), WALK, None), collect(mixed("corrected"), WALK, None)]
     starts = {float(each.truth[:, k].sum()): 0 for each in collected for k in range(2)}
-    rng, n_drawn, size = np.random.default_rng(0), 0, collected[0].cells.lanes.size
+    rng, n_drawn, size = np.random.default_rng(0), 0, len(collected[0].cells.fixed)
     for _ in range(30):
         batch = draw_batch(rng, collected, 3)
         assert batch.roads.n_episodes == 3
@@ -378,7 +378,7 @@ def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_p
         ({"rounds": ()}, "rounds must begin"),
         ({"windows": 4}, r"windows must be an integer in 1\.\.3, got 4"),
         ({"teacher": 0.5}, "teacher must be 0 without an initial network, got 0.5"),
-        ({"kind": "densities"}, "kind must be one of 'flows', 'speeds', got 'densities'"),
+        ({"kind": "densities"}, "kind must be one of flows, speeds, got 'densities'"),
         ({"validation_highways": (5, 9)}, r"validation_highways must be .* outside of \(0, 80\)"),
         ({"initial": "nowhere"}, r"weights must be a file or one of highway, .*, got 'nowhere'"),
     ],

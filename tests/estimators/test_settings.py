@@ -44,7 +44,7 @@ FILE = {"mhe-paper-corrected": ENTRY}
     [
         ("process_noise", (-1.0, 0.0), r"process_noise\[0\] must be .*, got -1\.0"),
         ("walk_noise", (float("nan"), 0.0), r"walk_noise\[0\] must be .*, got nan"),
-        ("bounds", "ball", r"bounds must be one of 'cone', 'box', got 'ball'"),
+        ("bounds", "ball", r"bounds must be one of cone, box, got 'ball'"),
         ("mhe", {"arrival_noise": [0.1, 0.0]}, r"mhe\.arrival_noise\[1\] must be .*, got 0\.0"),
         ("enkf", {"n_member": 50}, r"enkf\.n_member is unknown; allowed: n_members"),
     ],

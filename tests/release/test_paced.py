@@ -313,7 +313,7 @@ def test_the_report_says_what_is_guaranteed(unit, adjacency):
         ({"pace": 0.0}, r"pace must be .* \[0\.05, 1\], got 0\.0$"),
         ({"clip": math.inf}, r"clip must be .* \[1, 200\], got inf$"),
         ({"ratio": 1.0001}, r"ratio must be at most 1 for .*, got 1\.0001$"),
-        ({"unit": "horizon"}, r"unit must be one of 'trip', 'event', got 'horizon'$"),
+        ({"unit": "horizon"}, r"unit must be one of trip, event, got 'horizon'$"),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named_with_their_path(fields, message):
