@@ -165,13 +165,14 @@ MUTANTS = (
     # --- one vehicle --------------------------------------------------------------------------
     Mutant(
         "two vehicles share a ledger", 4, "release/vehicles.py",
-        "s, v = place[row], vehicle[row]", "s, v = place[row], vehicle[row] // 2",
+        "s, v = rows.place[row], rows.vehicle[row]",
+        "s, v = rows.place[row], rows.vehicle[row] // 2",
         "test_guarantee.py",
     ),
     Mutant(
         "a segment answers for three vehicles at most", 4, "release/vehicles.py",
-        "if ledgers[g, v] + cost <= budget[g]:",
-        "if ledgers[g, v] + cost <= budget[g] and counts[c] < 3:",
+        "if ledgers[g, v] + cost <= terms.budget[g]:",
+        "if ledgers[g, v] + cost <= terms.budget[g] and counts[c] < 3:",
         "test_guarantee.py",
     ),
     Mutant(
@@ -203,7 +204,7 @@ MUTANTS = (
     Mutant(
         "a deviation is charged before it is rounded", 6, "release/vehicles.py",
         "d = steps * grid[c]",
-        "d = min(max(min(reported, fastest) - centre[k, s], -clip), clip)",
+        "d = min(max(min(reported, terms.fastest) - centre[k, s], -clip), clip)",
         "release/test_vehicles.py",
     ),
     Mutant(
@@ -213,18 +214,18 @@ MUTANTS = (
     ),
     Mutant(
         "deviations are charged unclipped and released clipped", 6, "release/vehicles.py",
-        "d = steps * grid[c]", "d = min(reported, fastest) - centre[k, s]",
+        "d = steps * grid[c]", "d = min(reported, terms.fastest) - centre[k, s]",
         "test_guarantee.py",
     ),
     Mutant(
         "deviations are charged clipped and released unclipped", 6, "release/vehicles.py",
         "deviations[c] += np.int64(steps)",
-        "deviations[c] += np.int64((min(reported, fastest) - centre[k, s]) / grid[c])",
+        "deviations[c] += np.int64((min(reported, terms.fastest) - centre[k, s]) / grid[c])",
         "test_guarantee.py",
     ),
     Mutant(
         "a vehicle is charged for being counted alone", 6, "release/vehicles.py",
-        "prices[k, c] * (1.0 + ratio * d * d / (clip * clip))", "prices[k, c]",
+        "prices[k, c] * (1.0 + terms.ratio * d * d / (clip * clip))", "prices[k, c]",
         "test_guarantee.py",
     ),
     Mutant(
@@ -271,8 +272,8 @@ MUTANTS = (
     ),
     Mutant(
         "a ledger goes with the segment", 10, "release/vehicles.py",
-        "s, v = place[row], vehicle[row]",
-        "s, v = place[row], (vehicle[row] + place[row]) % paid.shape[2]",
+        "s, v = rows.place[row], rows.vehicle[row]",
+        "s, v = rows.place[row], (rows.vehicle[row] + rows.place[row]) % paid.shape[2]",
         "test_guarantee.py",
     ),
     Mutant(
@@ -304,7 +305,7 @@ MUTANTS = (
     ),
     Mutant(
         "the last payment overdraws the ledger", 11, "release/vehicles.py",
-        "if ledgers[g, v] + cost <= budget[g]:", "if ledgers[g, v] <= budget[g]:",
+        "if ledgers[g, v] + cost <= terms.budget[g]:", "if ledgers[g, v] <= terms.budget[g]:",
         "test_guarantee.py",
     ),
     Mutant(

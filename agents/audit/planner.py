@@ -12,6 +12,7 @@ from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface, make_release
 from dptse_env.release import QueryOptions
+from dptse_env.release.vehicles import Terms
 from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -89,9 +90,9 @@ class Planner:
         # The option to ask for each segment, shape (n_mainline,): the cheapest.
         self._option = np.argmin(np.where(queries.covers.T, queries.cost, math.inf), axis=1)
         ledgers = getattr(self._release, "ledgers", None)
-        self._clip = getattr(ledgers, "clip", math.inf)
-        self._fastest = float(getattr(ledgers, "fastest", math.inf))
-        self._budget = math.inf if ledgers is None else float(ledgers.budget[0])
+        terms = Terms(np.full(1, math.inf)) if ledgers is None else ledgers.terms
+        self._clip, self._fastest = terms.clip, float(terms.fastest)
+        self._budget = float(terms.budget[0])
         # Where all seconds cost the same, the number of those that count.
         self._cap = int(min(self._budget, config.horizon_steps))
         self._limits = np.array(corridor.with_boundaries(corridor.speed_limits))

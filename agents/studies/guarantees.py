@@ -91,7 +91,7 @@ class Exact(Paced):
     def __init__(self, task: Task, traffic: Traffic) -> None:
         """Make ledgers without a limit."""
         super().__init__(task, traffic)
-        self.ledgers.budget[:] = math.inf
+        self.ledgers.terms.budget[:] = math.inf
         self.pacing = AnyPrice(task, self.pacing.budget)
 
 

@@ -29,7 +29,7 @@ from dptse_env.release.noise import Noise
 from dptse_env.release.report import PrivacyReport, QuantityReport, in_order
 from dptse_env.release.settings import CHANGES, BoundaryInputs, PrivacySettings
 from dptse_env.release.task import Request, Task
-from dptse_env.release.vehicles import Ledgers, Traffic, require_exact_sums
+from dptse_env.release.vehicles import Ledgers, Terms, Traffic, require_exact_sums
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.fields import Interval
@@ -83,15 +83,13 @@ class GaussianRelease(ReleaseModel):
         self._centre = np.full((n, task.n_cells), v_0)
         self._price = np.ones((n, task.n_channels))
         self.noise = Noise(n, task.n_channels, task.settings.noise)
-        self.ledgers = self._ledgers()
+        self.ledgers = Ledgers(task.channels, n, self._terms())
         if task.releases_flow:
-            require_exact_sums(self.added_std[0].min(axis=0), self.ledgers.clip)
+            require_exact_sums(self.added_std[0].min(axis=0), self.ledgers.terms.clip)
 
-    def _ledgers(self) -> Ledgers:
-        """Return ledgers of the vehicles, by which they may count without end."""
-        return Ledgers(
-            self.task.channels, self.task.n_episodes, np.full(len(self.task.groups), math.inf)
-        )
+    def _terms(self) -> Terms:
+        """Return terms on which vehicles may count without end."""
+        return Terms(np.full(len(self.task.groups), math.inf))
 
     @abstractmethod
     def _sensitivity(self, group: int) -> Sensitivity:
@@ -326,13 +324,14 @@ class Capped(GaussianRelease):
         """Return half of the largest speed limit, the centre of the speeds clipped to it."""
         return 0.5 * corridor.largest_speed_limit
 
-    def _ledgers(self) -> Ledgers:
-        """Return ledgers by which a vehicle counts as often as the cap allows in each group."""
+    def _terms(self) -> Terms:
+        """Return terms on which a vehicle counts as often as the cap allows in each group."""
         task, cap = self.task, self.task.settings.contribution_cap
-        budget = np.full(len(task.groups), math.inf if cap is None else float(cap))
-        clip = self.flow_centre(task.corridor, task.settings)
-        fastest = task.corridor.largest_speed_limit
-        return Ledgers(task.channels, task.n_episodes, budget, clip=clip, fastest=fastest)
+        return Terms(
+            np.full(len(task.groups), math.inf if cap is None else float(cap)),
+            clip=self.flow_centre(task.corridor, task.settings),
+            fastest=np.float32(task.corridor.largest_speed_limit),
+        )
 
     def _sensitivity(self, group: int) -> Sensitivity:
         corridor, settings = self.task.corridor, self.task.settings

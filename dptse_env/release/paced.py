@@ -26,7 +26,7 @@ from dptse_env.release.pacing import EventPacing, Pacing, TripPacing
 from dptse_env.release.report import PrivacyReport
 from dptse_env.release.settings import CHANGES, BoundaryInputs, PrivacySettings
 from dptse_env.release.task import Request, Task
-from dptse_env.release.vehicles import Ledgers, Traffic, require_exact_sums
+from dptse_env.release.vehicles import Ledgers, Terms, Traffic, require_exact_sums
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import Interval
@@ -123,14 +123,13 @@ class Paced(ReleaseModel):
         self._squares = 2.0 if settings.adjacency == "replace" else 1.0
         self._whole = self.mu**2
         self.budget = self._whole / self._squares
-        self.ledgers = Ledgers(
-            task.channels,
-            n,
+        terms = Terms(
             (1.0 - ROUNDING) * self.budget,
             ratio=settings.ratio,
             clip=settings.clip,
-            fastest=task.corridor.largest_speed_limit,
+            fastest=np.float32(task.corridor.largest_speed_limit),
         )
+        self.ledgers = Ledgers(task.channels, n, terms)
         pacing = EventPacing if settings.unit == "event" else TripPacing
         # A pacing that offers the whole budget at once stays below what ledgers hold back.
         self.pacing: Pacing = pacing(task, (1.0 - 2.0 * ROUNDING) * self.budget)

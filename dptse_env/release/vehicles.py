@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,7 @@ from dptse_env.release.noise import grid_of
 from dptse_env.traffic import MOST_VEHICLES, Corridor, Penetration, Record, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import require
-from dptse_env.utils.kernels import kernel
+from dptse_env.utils.kernels import Bundle, kernel
 
 GROWTH = 1.5
 """Factor on the size of full tables."""
@@ -167,42 +167,36 @@ def _longer(column: NDArray[NumberT], size: int) -> NDArray[NumberT]:
     return longer
 
 
+class Terms(NamedTuple):
+    """Terms on which vehicles pay; by default no contribution is clipped or costs by its speed.
+
+    Attributes:
+        budget: Largest total that a vehicle can pay in each group, shape (groups,).
+        ratio: r, at most 1 where vehicles are replaced: two may deviate in opposite directions.
+        clip: D [km/h].
+        fastest: Speed that reports are clipped to [km/h], a float32 as reports are.
+    """
+
+    budget: FloatArray
+    ratio: float = 0.0
+    clip: float = math.inf
+    fastest: np.float32 = np.float32(math.inf)
+
+
 class Ledgers:
     """Ledgers of the vehicles of each episode: what each has paid in each group of columns.
 
     Attributes:
-        budget: Largest total that a vehicle can pay in each group, shape (groups,).
-        ratio: r.
-        clip: D [km/h].
-        fastest: Speed that reports are clipped to [km/h].
+        terms: Budgets, and what is charged.
         paid: What each vehicle has paid, shape (n, groups, vehicles); as wide as the largest record
             so far.
     """
 
-    def __init__(
-        self,
-        channels: Channels,
-        n_episodes: int,
-        budget: FloatArray,
-        *,
-        ratio: float = 0.0,
-        clip: float = math.inf,
-        fastest: float = math.inf,
-    ) -> None:
-        """Prepare for episodes; by default no contribution is clipped or costs by its speed.
-
-        Args:
-            channels: What is measured.
-            n_episodes: Episodes n.
-            budget: See the attributes, as for the others.
-            ratio: At most 1 where vehicles are replaced: two may deviate in opposite directions.
-            clip: [km/h].
-            fastest: [km/h].
-        """
-        self.budget, self.ratio, self.clip = budget, ratio, clip
-        self.fastest = np.float32(fastest)
-        self.paid: FloatArray = np.zeros((n_episodes, budget.size, 0))
-        self._channels = channels
+    def __init__(self, channels: Channels, n_episodes: int, terms: Terms) -> None:
+        """Prepare for n episodes."""
+        self.terms = terms
+        self.paid: FloatArray = np.zeros((n_episodes, terms.budget.size, 0))
+        self._bundle = Bundle(channels, terms)
 
     def reset(self, episodes: IntArray, n_vehicles: IntArray | None = None) -> None:
         """Clear the ledgers of episodes (k,), with room for the vehicles of every record."""
@@ -237,14 +231,7 @@ class Ledgers:
             of the noise and zero where not observed; and the contributions that ledgers did not
             cover, shape (k, groups).
         """
-        sums = np.empty((*observed.shape, 2))
-        refused = np.zeros((len(sums), self.budget.size), dtype=np.int64)
-        _collect(
-            *self._channels[:3], rows.start, rows.stop, rows.vehicle, rows.place, rows.speed,
-            episodes, observed, prices, centre, sigma, self.fastest, self.clip, self.ratio,
-            self.budget, self.paid, sums, refused,
-        )  # fmt: skip
-        return sums, refused
+        return _collect(self._bundle, rows, episodes, observed, prices, centre, sigma, self.paid)
 
     def of(self, episodes: IntArray, n_vehicles: IntArray) -> list[FloatArray]:
         """Return what each vehicle of k episodes has paid, arrays of shape (groups, n_vehicles)."""
@@ -254,28 +241,20 @@ class Ledgers:
 
 @kernel
 def _collect(
-    first: IntArray,
-    span: IntArray,
-    group: IntArray,
-    start: IntArray,
-    stop: IntArray,
-    vehicle: NDArray[np.int32],
-    place: NDArray[np.int16],
-    speed: NDArray[np.float32],
+    bundle: Bundle,
+    rows: VehicleRows,
     episodes: IntArray,
     observed: BoolArray,
     prices: FloatArray,
     centre: FloatArray,
     sigma: FloatArray,
-    fastest: Any,
-    clip: float,
-    ratio: float,
-    budget: FloatArray,
     paid: FloatArray,
-    sums: FloatArray,
-    refused: IntArray,
-) -> None:
+) -> tuple[FloatArray, IntArray]:
+    channels, terms = bundle.parts
+    first, span, clip = channels.first, channels.span, terms.clip
     n_columns, n_places = first.size, centre.shape[1]
+    sums = np.empty((episodes.size, n_columns, 2))
+    refused = np.zeros((episodes.size, terms.budget.size), dtype=np.int64)
     n_covering = np.empty(n_places, dtype=np.int64)
     covering = np.empty((n_places, n_columns), dtype=np.int64)
     counts, deviations = np.empty(n_columns, dtype=np.int64), np.empty(n_columns, dtype=np.int64)
@@ -292,20 +271,20 @@ def _collect(
                     covering[s, n_covering[s]] = c
                     n_covering[s] += 1
         ledgers = paid[episodes[k]]
-        for row in range(start[k], stop[k]):
-            s, v = place[row], vehicle[row]
+        for row in range(rows.start[k], rows.stop[k]):
+            s, v = rows.place[row], rows.vehicle[row]
             # A vehicle pays for every query that covers it, in the order of the columns.
             for i in range(n_covering[s] if s < n_places else 0):
                 c = covering[s, i]
-                g = group[c]
-                reported = speed[g, row]
+                g = channels.group[c]
+                reported = rows.speed[g, row]
                 if reported < 0.0:
                     continue
-                steps = np.rint((min(reported, fastest) - centre[k, s]) / grid[c])
+                steps = np.rint((min(reported, terms.fastest) - centre[k, s]) / grid[c])
                 steps = min(max(steps, -most[c]), most[c])
                 d = steps * grid[c]
-                cost = prices[k, c] * (1.0 + ratio * d * d / (clip * clip))
-                if ledgers[g, v] + cost <= budget[g]:
+                cost = prices[k, c] * (1.0 + terms.ratio * d * d / (clip * clip))
+                if ledgers[g, v] + cost <= terms.budget[g]:
                     ledgers[g, v] += cost
                     counts[c] += 1
                     deviations[c] += np.int64(steps)
@@ -314,6 +293,7 @@ def _collect(
         for c in range(n_columns):
             sums[k, c, 0] = counts[c]
             sums[k, c, 1] = deviations[c] * grid[c]
+    return sums, refused
 
 
 def require_exact_sums(sigma: FloatArray, clip: float) -> None:

@@ -148,7 +148,7 @@ def test_squared_parameters_of_groups_add_up_and_the_report_names_each(preset, a
     assert groups[0]["noise_std"] == release.sigma.tolist()
     assert groups[1]["noise_std"] != groups[0]["noise_std"]
     if preset == "paced":
-        assert release.ledgers.budget == pytest.approx(release.mu**2 / 2.0)
+        assert release.ledgers.terms.budget == pytest.approx(release.mu**2 / 2.0)
 
 
 @pytest.mark.parametrize("preset", ["capped", "paced"])

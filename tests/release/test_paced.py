@@ -21,6 +21,7 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of, mu_of
 from dptse_env.release import Paced, PacedSettings
 from dptse_env.release.noise import LARGEST_SIGMA, Noise
+from dptse_env.release.vehicles import Ledgers
 from tests.helpers import AWAY, record
 
 from .worlds import (
@@ -232,7 +233,7 @@ def test_a_part_of_the_budget_is_kept_back_for_rounding(adjacency):
     counts = [release.collect(asked, *public)[0][0, 1, 0] for _ in range(4)]
     assert counts == [1.0, 1.0, 1.0, 0.0]
     (offered,) = release.pacing.budget
-    assert offered < release.ledgers.budget[0] < release.budget[0]
+    assert offered < release.ledgers.terms.budget[0] < release.budget[0]
 
 
 def test_more_payments_than_the_reserve_covers_are_refused(monkeypatch):
@@ -365,7 +366,7 @@ def exhausting(worlds, asked, within=T, **options):
     seconds = collected(release, Public.constant(release, least))
     paid = [release.ledgers.paid.copy(), *(release.ledgers.paid.copy() for _ in seconds)]
     most = max((paid[t + within] - paid[t]).max() for t in range(T + 1 - within))
-    return (1.0 - 1e-6) * release.ledgers.budget[0] * least / most
+    return (1.0 - 1e-6) * release.ledgers.terms.budget[0] * least / most
 
 
 def reached(worlds, asked, price, **options):
@@ -403,7 +404,9 @@ def test_a_ratio_above_one_exceeds_mu_under_replace():
     for ratio, least, most in ((1.0, 0.999, 1.0), (2.0, 1.33, 1.34)):
         release = started(Worlds(PASSES, STANDS), clip=25.0)
         object.__setattr__(release.task.settings, "ratio", ratio)  # 2 is refused
-        release.ledgers.ratio = ratio
-        price = 0.999999 * release.ledgers.budget[0] / (T * (1.0 + ratio))
+        terms = release.ledgers.terms._replace(ratio=ratio)
+        release.ledgers = Ledgers(release.task.channels, 2, terms)
+        release.ledgers.reset(BOTH, release.traffic.n_vehicles)
+        price = 0.999999 * release.ledgers.terms.budget[0] / (T * (1.0 + ratio))
         public = Public.constant(release, price)
         assert least < squared_distance(release, public) / release.mu[0] ** 2 <= most

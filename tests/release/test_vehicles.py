@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from dptse_env.model import Channels
 from dptse_env.release import Group, PacedSettings, Traffic
-from dptse_env.release.vehicles import Ledgers, require_exact_sums
+from dptse_env.release.vehicles import Ledgers, Terms, require_exact_sums
 from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
 from tests.helpers import UNEVEN, pairwise
 
@@ -109,7 +110,7 @@ def test_ledgers_count_as_they_do_when_written_out(spans, groups, ratio):
 
 
 def test_a_reset_begins_new_budgets_in_its_episodes_alone_and_a_wider_record_keeps_the_others():
-    ledgers = Ledgers((ONE, ONE + 1, ONE), 2, np.ones(1))
+    ledgers = Ledgers(Channels(ONE, ONE + 1, ONE, np.ones(1)), 2, Terms(np.ones(1)))
     ledgers.reset(BOTH, np.array([20, 10]))
     ledgers.paid += np.arange(1.0, 41.0).reshape(2, 1, 20)
     kept = ledgers.paid[0].copy()

@@ -84,9 +84,7 @@ class Worlds:
         """A release model whose episodes have begun, with other ledgers if a class is given."""
         release, n = self.release(settings, **keywords), len(self.records)
         if ledgers is not None:
-            own = release.ledgers
-            numbers = {name: getattr(own, name) for name in ("ratio", "clip", "fastest")}
-            release.ledgers = ledgers(release.task.channels, n, own.budget, **numbers)
+            release.ledgers = ledgers(release.task.channels, n, release.ledgers.terms)
         release.reset(np.arange(n), streams(*range(seed, seed + n)))
         return release
 
@@ -185,9 +183,9 @@ class PlainLedgers(Ledgers):
     """Ledgers written out in Python."""
 
     def collect(self, episodes, observed, rows, prices, centre, sigma):
-        first, span, group, _ = self._channels
+        (first, span, group, _), (_, ratio, clip, _) = self._bundle.parts
         sums = np.zeros((*observed.shape, 2))
-        refused = np.zeros((len(observed), self.budget.size), dtype=np.int64)
+        refused = np.zeros((len(observed), self.terms.budget.size), dtype=np.int64)
         for k, episode in enumerate(episodes.tolist()):
             for row in range(rows.start[k], rows.stop[k]):
                 place, vehicle = int(rows.place[row]), int(rows.vehicle[row])
@@ -198,12 +196,12 @@ class PlainLedgers(Ledgers):
                     g = int(group[column])
                     if rows.speed[g, row] < 0.0:
                         continue
-                    raw = float(min(rows.speed[g, row], self.fastest)) - centre[k, place]
+                    raw = float(min(rows.speed[g, row], self.terms.fastest)) - centre[k, place]
                     grid = grid_of(float(sigma[k, column, 1]))
-                    most = np.floor(self.clip / grid)
+                    most = np.floor(clip / grid)
                     d = min(max(np.rint(raw / grid), -most), most) * grid
-                    cost = prices[k, column] * (1.0 + self.ratio * d * d / (self.clip * self.clip))
-                    if self.paid[episode, g, vehicle] + cost <= self.budget[g]:
+                    cost = prices[k, column] * (1.0 + ratio * d * d / (clip * clip))
+                    if self.paid[episode, g, vehicle] + cost <= self.terms.budget[g]:
                         self.paid[episode, g, vehicle] += cost
                         sums[k, column] += 1.0, d
                     else:

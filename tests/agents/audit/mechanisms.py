@@ -62,7 +62,7 @@ class NoBudget:
 
     def __init__(self, task, traffic):
         super().__init__(task, traffic)
-        self.ledgers.budget[:] = np.inf
+        self.ledgers.terms.budget[:] = np.inf
 
 
 class TwiceTheBudget:
@@ -70,7 +70,7 @@ class TwiceTheBudget:
 
     def __init__(self, task, traffic):
         super().__init__(task, traffic)
-        self.ledgers.budget *= 2.0
+        self.ledgers.terms.budget[:] *= 2.0
 
 
 class NewPseudonyms:
