@@ -379,7 +379,7 @@ def _spans(
         require(model.releases_sums, path, plain, spans)
         alike = "(1,) where mainline segments differ in length"
         require(len(set(corridor.segment_lengths[:n])) == 1, path, alike, spans)
-        centre = model.flow_centre(corridor, privacy)
+        centre = model.centre(corridor, privacy)
         require(centre is not None, path, "(1,) where mean speeds are released", spans)
     return spans
 
@@ -629,7 +629,7 @@ def _inherited(
     is_other = is_other_road or parameters != load_parameters(tuned_with(parameters))
     if is_other and config.settings_name is not None and "estimator_settings" not in given:
         found.append("estimator_settings")
-    centre = config.release_model.flow_centre(corridor, config.privacy)
+    centre = config.release_model.centre(corridor, config.privacy)
     estimator: type[Estimator] = ESTIMATORS.find(config.estimator)
     spans = max(config.query_spans)
     found += estimator.inherits(corridor.road, centre is not None, spans, config.settings())

@@ -129,7 +129,7 @@ def make_model(config: EnvConfig) -> ARZModel:
         config.corridor.road,
         config.parameters,
         TIME_STEP,
-        reference_speed=task.flow_centre,
+        centre=task.centre,
         channels=task.channels.head(task.n_on_road),
     )
 
@@ -143,7 +143,7 @@ def make_task(config: EnvConfig, n_episodes: int = 1) -> Task:
         corridor=config.corridor,
         queries=config.queries,
         horizon=config.horizon_steps,
-        flow_centre=model.flow_centre(config.corridor, privacy),
+        centre=model.centre(config.corridor, privacy),
         has_prices=model.has_prices,
         n_episodes=n_episodes,
         groups=make_groups(

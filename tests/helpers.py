@@ -334,7 +334,7 @@ class SumRelease(ReleaseModel):
     sigma = np.array([4.0, 150.0])  # [veh/km, veh/h]
 
     @classmethod
-    def flow_centre(cls, corridor, settings):
+    def centre(cls, corridor, settings):
         return 0.5 * corridor.speed_limit
 
     def __init__(self, task, traffic):
@@ -390,7 +390,7 @@ class MeanRelease(SumRelease):
     """One that says that it releases sums, and releases mean speeds."""
 
     @classmethod
-    def flow_centre(cls, corridor, settings):
+    def centre(cls, corridor, settings):
         return None
 
 

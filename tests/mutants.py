@@ -324,7 +324,7 @@ MUTANTS = (
         "test_guarantee.py",
     ),
     Mutant(
-        "flows are not centred on the middle of the speeds", 12, "release/gaussian.py",
+        "flows are not centred on the middle of the speeds", 12, "release/model.py",
         "return 0.5 * corridor.largest_speed_limit", "return 0.4 * corridor.largest_speed_limit",
         "test_guarantee.py",
     ),
@@ -573,7 +573,7 @@ MUTANTS = (
     Mutant(
         "released boundary flows are read around v_0", 20, "measurement/boundary.py",
         "np.maximum(density, self._least_density) + centre",
-        "np.maximum(density, self._least_density) + model.reference_speed",
+        "np.maximum(density, self._least_density) + model.centre",
         "measurement/test_boundary.py",
     ),
     Mutant(

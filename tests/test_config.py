@@ -82,7 +82,7 @@ def test_partial_overrides_keep_the_rest():
     assert config.corridor == SHORT_HIGHWAY
     config = resolve("private-highway", {"privacy": "corrected"})
     assert config.privacy == PrivacySettings("corrected", epsilon=5.0)
-    assert make_task(config).flow_centre is None
+    assert make_task(config).centre is None
     config = resolve("paper-highway", {"privacy": "capped", "epsilon": 2})
     assert config.privacy == CappedSettings(epsilon=2.0)
     assert config.privacy.boundary == "nominal"

@@ -128,7 +128,7 @@ def with_demand(model: ARZModel, settings: Any) -> ARZModel:
     if has_demand == (model.n_demand_states > 0):
         return model
     return ARZModel(
-        model.road, model.parameters, model.time_step, model.reference_speed, model.channels,
+        model.road, model.parameters, model.time_step, model.centre, model.channels,
         has_demand,
     )  # fmt: skip
 

@@ -145,7 +145,7 @@ def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stenci
         delay=delay,
         weight=np.array([line[3] for line in lines]),
         first=np.array(first, dtype=np.int64),
-        flows=model.reference_speed is not None,
+        flows=model.centre is not None,
         decay=math.exp(-step / settings.time),
         threshold=float(settings.threshold),
         transition=float(settings.transition),

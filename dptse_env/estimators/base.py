@@ -102,9 +102,9 @@ class Measurement(NamedTuple):
         if not (np.isfinite(deviations) & (deviations >= 0.0)).all():
             raise ValueError("sigma must be finite and >= 0")
         places = len(seen), model.n_segments
-        if model.reference_speed is None:
+        if model.centre is None:
             return cls(seen, given, deviations, np.full(places, np.nan))
-        around = _full("centre", model.reference_speed if centre is None else centre, places)
+        around = _full("centre", model.centre if centre is None else centre, places)
         if not np.isfinite(around).all():
             raise ValueError("centre must be finite")
         return cls(seen, given, deviations, around)

@@ -123,7 +123,7 @@ class Mixture(Estimator):
         """Return errors (k, M, 2) of an estimate in what it foretells, and their variances."""
         density, speed, density_std, speed_std = estimate
         second, variance = speed, speed_std**2
-        if self.model.reference_speed is not None:
+        if self.model.centre is not None:
             slip = speed - measured.centre
             second = density * slip
             variance = (density * speed_std) ** 2 + (slip * density_std) ** 2

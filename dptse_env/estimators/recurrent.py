@@ -64,7 +64,7 @@ class Recurrent(Estimator):
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        flows = model.reference_speed is not None
+        flows = model.centre is not None
         self.saved = network_for(settings.recurrent.weights, model.road, flows)
         S, n = model.n_segments, n_episodes
         self.hidden = np.zeros((n, S, self.saved.network.width), dtype=np.float32)
@@ -80,7 +80,7 @@ class Recurrent(Estimator):
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
         """Refuse weights that are missing or cannot be read."""
-        flows = model.reference_speed is not None
+        flows = model.centre is not None
         network_for(settings.recurrent.weights, model.road, flows)
 
     @classmethod

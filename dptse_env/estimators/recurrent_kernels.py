@@ -102,7 +102,7 @@ def make_cells(model: ARZModel) -> Cells:
     return Cells(
         unit=DENSITY_UNIT * road.lanes,
         limit=float(limits.max()),
-        flows=model.reference_speed is not None,
+        flows=model.centre is not None,
         fixed=np.concatenate([marks, lanes[:, None] / 3.0, scales], axis=1),
     )
 

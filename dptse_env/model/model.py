@@ -39,7 +39,7 @@ class ARZModel:
         road: The road.
         parameters: Parameters of the model; each cell's jam density follows its lanes.
         time_step: T [s].
-        reference_speed: v_0 [km/h], where sensors release the centred flow rho (v - v_0) [veh/h];
+        centre: v_0 [km/h], where sensors release the centred flow rho (v - v_0) [veh/h];
             None where they release the speed. A release may have a centre of its own for each
             segment in its place.
         channels: What is measured, on segments; None for each of them by itself.
@@ -60,7 +60,7 @@ class ARZModel:
         measurement_scale: Units of the two numbers of a channel.
 
     Raises:
-        ValueError: A channel leaves the segments, the reference speed is negative or not finite, or
+        ValueError: A channel leaves the segments, the centre is negative or not finite, or
             a channel covers several segments where mean speeds are released, which have no sum. The
             dynamics, not the constructor, refuse a time step that violates the CFL condition.
     """
@@ -70,7 +70,7 @@ class ARZModel:
         road: Road,
         parameters: ARZParameters,
         time_step: float = 1.0,
-        reference_speed: float | None = None,
+        centre: float | None = None,
         channels: Channels | None = None,
         demand_states: bool = False,
     ) -> None:
@@ -93,12 +93,12 @@ class ARZModel:
         first, span = self.channels.first, self.channels.span
         if not ((first >= 0) & (span >= 1) & (first + span <= self.n_segments)).all():
             raise ValueError(f"model.channels must cover segments in 0..{self.n_segments - 1}")
-        if reference_speed is None and not (span == 1).all():
+        if centre is None and not (span == 1).all():
             raise ValueError("model.channels must be segments where mean speeds are released")
-        self.reference_speed: float | None = None
+        self.centre: float | None = None
         second = self.speed_scale
-        if reference_speed is not None:
-            self.reference_speed = non_negative("model.reference_speed", reference_speed)
+        if centre is not None:
+            self.centre = non_negative("model.centre", centre)
             second = self.density_scale * self.speed_scale
         self.measurement_scale: FloatArray = np.array([self.density_scale, second])
         step_ratio = time_step / SECONDS_PER_HOUR / road.lengths[: self.n_segments]
@@ -252,12 +252,12 @@ class ARZModel:
 
         Args:
             states: `(n, n_x)`.
-            centre: v_0 of each segment `(S,)` or `(n, S)` [km/h]; None for the reference speed.
+            centre: v_0 of each segment `(S,)` or `(n, S)` [km/h]; None for the model's own.
         """
-        if self.reference_speed is None:
+        if self.centre is None:
             return self.traffic(states)[:, self.channels.first]
         rho, psi = self.components(states)
-        v_0 = self.reference_speed if centre is None else centre
+        v_0 = self.centre if centre is None else centre
         flow = psi - rho * (self.pressure(rho) + v_0)
         return self.averages(np.stack([rho, flow], axis=-1))
 
@@ -265,11 +265,11 @@ class ARZModel:
         self, states: FloatArray, centre: FloatArray | None = None
     ) -> FloatArray:
         """Derivative of `measure` by the state, `(n, M, 2, n_x)`."""
-        if self.reference_speed is None:
+        if self.centre is None:
             blocks = self.traffic_jacobian(states)
         else:
             rho, _ = self.components(states)
-            v_0 = self.reference_speed if centre is None else centre
+            v_0 = self.centre if centre is None else centre
             by_rho = -(1.0 + self.parameters.gamma) * self.pressure(rho) - v_0
             blocks = _blocks(by_rho, np.ones_like(rho))
         n, S = blocks.shape[:2]

@@ -24,7 +24,7 @@ from dptse_env.privacy import (
     printed_noise_std,
     single_noise_std,
 )
-from dptse_env.release.model import ReleaseModel
+from dptse_env.release.model import ReleaseModel, middle_speed
 from dptse_env.release.noise import Noise
 from dptse_env.release.report import PrivacyReport, QuantityReport, in_order
 from dptse_env.release.settings import CHANGES, BoundaryInputs, PrivacySettings
@@ -79,7 +79,7 @@ class GaussianRelease(ReleaseModel):
         else:
             self.unit, self.added_std = task.channels.length / shortest, sigma
         self._released_sigma = self.added_std / self.unit[:, None]
-        v_0 = math.nan if task.flow_centre is None else task.flow_centre
+        v_0 = math.nan if task.centre is None else task.centre
         self._centre = np.full((n, task.n_cells), v_0)
         self._price = np.ones((n, task.n_channels))
         self.noise = Noise(n, task.n_channels, task.settings.noise)
@@ -320,16 +320,16 @@ class Capped(GaussianRelease):
     needs_vehicles: ClassVar[bool] = True
 
     @classmethod
-    def flow_centre(cls, corridor: Corridor, settings: CappedSettings) -> float:
-        """Return half of the largest speed limit, the centre of the speeds clipped to it."""
-        return 0.5 * corridor.largest_speed_limit
+    def centre(cls, corridor: Corridor, settings: CappedSettings) -> float:
+        """Return the middle of the speeds, which are clipped to the largest limit."""
+        return middle_speed(corridor)
 
     def _terms(self) -> Terms:
         """Return terms on which a vehicle counts as often as the cap allows in each group."""
         task, cap = self.task, self.task.settings.contribution_cap
         return Terms(
             np.full(len(task.groups), math.inf if cap is None else float(cap)),
-            clip=self.flow_centre(task.corridor, task.settings),
+            clip=self.centre(task.corridor, task.settings),
             fastest=np.float32(task.corridor.largest_speed_limit),
         )
 

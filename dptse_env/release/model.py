@@ -56,7 +56,7 @@ class ReleaseModel(ABC):
     by swaps, and which may be secure."""
 
     @classmethod
-    def flow_centre(cls, corridor: Corridor, settings: Any) -> float | None:
+    def centre(cls, corridor: Corridor, settings: Any) -> float | None:
         """Return the speed v_0 [km/h] that released flows rho (v - v_0) are centred on.
 
         None where mean speeds are released.
@@ -93,14 +93,14 @@ class ReleaseModel(ABC):
         """
 
     def measurement(self, request: Request, values: FloatArray, sigma: FloatArray) -> Measurement:
-        """Return a release in which all columns answer, around the `flow_centre`.
+        """Return a release in which all columns answer, around the `centre`.
 
         Args:
             request: The request.
             values: Shape (k, C, 2), a fresh array.
             sigma: Shape (k, C, 2), or one that broadcasts to it.
         """
-        centre = math.nan if self.task.flow_centre is None else self.task.flow_centre
+        centre = math.nan if self.task.centre is None else self.task.centre
         places = np.full((len(values), self.task.n_cells), centre)
         return Measurement(request.observed, values, np.broadcast_to(sigma, values.shape), places)
 
@@ -161,6 +161,11 @@ class ReleaseModel(ABC):
             ValueError: Noise of this model cannot be set, or ``noise`` has another shape.
         """
         raise ValueError(f"noise of the release model {self.task.name!r} cannot be set")
+
+
+def middle_speed(corridor: Corridor) -> float:
+    """Return half of the largest speed limit [km/h]: speeds deviate alike to both sides."""
+    return 0.5 * corridor.largest_speed_limit
 
 
 def check_released(release: ReleaseModel, released: Any, request: Request) -> None:

@@ -20,7 +20,7 @@ from dptse_env.privacy import (
     mu_of,
     require_covered,
 )
-from dptse_env.release.model import ReleaseModel
+from dptse_env.release.model import ReleaseModel, middle_speed
 from dptse_env.release.noise import Noise
 from dptse_env.release.pacing import EventPacing, Pacing, TripPacing
 from dptse_env.release.report import PrivacyReport
@@ -109,9 +109,9 @@ class Paced(ReleaseModel):
     takes_noise: ClassVar[bool] = True
 
     @classmethod
-    def flow_centre(cls, corridor: Corridor, settings: PacedSettings) -> float | None:
-        """Return half of the largest speed limit; a release has a centre for each segment."""
-        return 0.5 * corridor.largest_speed_limit
+    def centre(cls, corridor: Corridor, settings: PacedSettings) -> float:
+        """Return the middle of the speeds; a release has a centre for each segment."""
+        return middle_speed(corridor)
 
     def __init__(self, task: Task, traffic: Traffic) -> None:
         """Compute the budgets; nothing is loaded."""

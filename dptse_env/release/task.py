@@ -46,7 +46,7 @@ class Task:
         corridor: The road, with the scales of densities and speeds.
         queries: The queries that can be chosen, the first G channels, and their bandwidth.
         horizon: Steps of an episode.
-        flow_centre: Speed v_0 [km/h] that released flows are centred on; None where mean speeds
+        centre: Speed v_0 [km/h] that released flows are centred on; None where mean speeds
             are released.
         has_prices: Whether queries have prices.
         n_episodes: Size n of the batch.
@@ -59,7 +59,7 @@ class Task:
     corridor: Corridor
     queries: QueryOptions
     horizon: int
-    flow_centre: float | None = None
+    centre: float | None = None
     has_prices: bool = False
     n_episodes: int = 1
     groups: tuple[Group, ...] = (Group("queries"),)
@@ -72,7 +72,7 @@ class Task:
     @property
     def releases_flow(self) -> bool:
         """True where flows are released, False where mean speeds are."""
-        return self.flow_centre is not None
+        return self.centre is not None
 
     # Channels -----------------------------------------------------------------------------------
 

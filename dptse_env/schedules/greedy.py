@@ -106,7 +106,7 @@ class GreedyTrace(ProcessSchedule):
         config, corridor, n = process.config, process.config.corridor, self.n_mainline
         settings, term = config.settings(), process.interface.reward.term
         sigma = np.array(settings.noise_scale) * process.expected_sigma / model.measurement_scale
-        centre = np.nan if model.reference_speed is None else model.reference_speed
+        centre = np.nan if model.centre is None else model.centre
         always = np.array(sorted(corridor.fixed_sensors), dtype=np.int64)
         return Design(
             bandwidth=self.bandwidth,

@@ -67,9 +67,7 @@ def model_of(parameters: str, release: str, road: Corridor = PAPER_HIGHWAY) -> A
     channels = None
     if release == "rows":
         channels = every_channel(len(road.segment_lengths), road.n_mainline)
-    return ARZModel(
-        road.road, load_parameters(parameters), reference_speed=speed, channels=channels
-    )
+    return ARZModel(road.road, load_parameters(parameters), centre=speed, channels=channels)
 
 
 def every_channel(n_segments: int, n_mainline: int) -> Channels:
@@ -156,9 +154,7 @@ def recorded(release: str) -> Episodes:
 def with_channels(episodes: Episodes, channels: Channels, places: IntArray) -> Episodes:
     """The same episodes where more could be measured, what is measured among it at some places."""
     old = episodes.model
-    model = ARZModel(
-        old.road, old.parameters, reference_speed=old.reference_speed, channels=channels
-    )
+    model = ARZModel(old.road, old.parameters, centre=old.centre, channels=channels)
     shape = (*episodes.observed.shape[:2], channels.size)
     observed, values, sigma = np.zeros(shape, bool), np.zeros((*shape, 2)), np.ones((*shape, 2))
     observed[..., places], values[..., places, :] = episodes.observed, episodes.values

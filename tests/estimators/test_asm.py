@@ -129,7 +129,7 @@ class Textbook:
         """Return innovations."""
         model, innovations = self.model, np.zeros(values.shape)
         S = model.n_segments
-        lanes, flows = model.road.lanes[:S], model.reference_speed is not None
+        lanes, flows = model.road.lanes[:S], model.centre is not None
         density, speed, density_std, speed_std = self.now.T
         floored = np.maximum(density, LEAST_DENSITY * lanes)
         evidence = self.evidence.copy()
@@ -176,8 +176,8 @@ def held_to_the_equations(episodes, settings, n_steps):
     smoother = started("asm", "compiled", episodes, settings)
     textbook = Textbook(model, episodes.start[0], settings)
     centre = np.full((n_steps, 1, model.n_segments), np.nan)
-    if model.reference_speed is not None:
-        centre[:] = model.reference_speed if episodes.centre is None else episodes.centre
+    if model.centre is not None:
+        centre[:] = model.centre if episodes.centre is None else episodes.centre
     for k in range(n_steps):
         step(smoother, episodes, k)
         textbook.predict(episodes.inputs[k, 0])

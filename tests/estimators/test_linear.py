@@ -52,7 +52,7 @@ SENSORS = {
         ARZModel(
             Stretch(n_mainline=1, segment_length=1.0).road,
             replace(PAPER, gamma=10.0),
-            reference_speed=V_0,
+            centre=V_0,
         ),
         np.array([[1.0, 0.0], [-V_0, 1.0]]),
         np.zeros(2),

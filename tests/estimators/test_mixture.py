@@ -31,7 +31,7 @@ def test_experts_are_weighed_by_what_they_foretell(release):
             rho, v, rho_std, v_std = expert.estimate()
             y, variance = v, v_std**2
             if release != "speed":
-                centre = model.reference_speed if episodes.centre is None else episodes.centre[k]
+                centre = model.centre if episodes.centre is None else episodes.centre[k]
                 y = rho * (v - centre)
                 variance = (rho * v_std) ** 2 + ((v - centre) * rho_std) ** 2
             for i in range(2):

@@ -84,8 +84,8 @@ def steps_of(name, backend, many):
 @pytest.mark.parametrize(("name", "backend"), EVERY)
 def test_every_name_and_backend_follows_the_protocol(name, backend):
     """And measures as its model does."""
-    for reference_speed, second in ((None, 80.0), (40.0, 30.0 * (80.0 - 40.0))):
-        model = ARZModel(MODEL.road, PAPER, 0.5, reference_speed)
+    for centre, second in ((None, 80.0), (40.0, 30.0 * (80.0 - 40.0))):
+        model = ARZModel(MODEL.road, PAPER, 0.5, centre)
         estimator, everyone = make_estimator(name, backend, model, 3), np.arange(3)
         states = model.states(np.full((3, 19), 30.0), np.full((3, 19), 80.0))
         np.testing.assert_allclose(estimator.model.measure(states)[..., 1], second)
@@ -154,14 +154,14 @@ def test_bad_measurements_are_named(changes, message):
         "sigma": np.ones(2),
         "centre": np.ones(5),
     }
-    model = ARZModel(Stretch(n_mainline=5).road, PAPER, reference_speed=50.0)
+    model = ARZModel(Stretch(n_mainline=5).road, PAPER, centre=50.0)
     with pytest.raises(ValueError, match=message):
         Measurement.of(model, **{**good, **changes})
 
 
 def test_what_a_measurement_leaves_out_is_filled_in_and_boundary_columns_are_left_out():
     observed, values, sigma = np.ones((2, 5), bool), np.zeros((2, 5, 2)), np.array([3.0, 4.0])
-    flows = ARZModel(Stretch(n_mainline=5).road, PAPER, reference_speed=50.0)
+    flows = ARZModel(Stretch(n_mainline=5).road, PAPER, centre=50.0)
     given = Measurement.of(flows, observed, values, sigma)
     np.testing.assert_array_equal(given.sigma, np.broadcast_to(sigma, (2, 5, 2)))
     np.testing.assert_array_equal(given.centre, np.full((2, 5), 50.0))

@@ -52,7 +52,7 @@ def channels(model, measured, inputs, prior, age):
         prior: Predictions and deviations, shape (S, 4).
         age: Seconds since the last measurement of each cell, shape (S,).
     """
-    cells, flows = make_cells(model), float(model.reference_speed is not None)
+    cells, flows = make_cells(model), float(model.centre is not None)
     observed, values, sigma, centre = (part[0] for part in measured)
     H = model.averaging[observed]  # of densities; a channel averages over its cells
     covers, values, sigma = H > 0.0, values[observed], sigma[observed]

@@ -32,7 +32,7 @@ class TextbookWalk:
         for m in np.flatnonzero(observed):
             for i in range(2):
                 H, value = self.model.averaging[m].copy(), values[m, i]
-                if i == 1 and self.model.reference_speed is not None:
+                if i == 1 and self.model.centre is not None:
                     H *= np.maximum(self.means[:, 0], 0.01 * self.model.jam_density)
                     value += H @ centre
                 P, residual = np.diag(self.variances[:, i]), value - H @ self.means[:, i]
@@ -98,7 +98,7 @@ def test_a_walk_that_is_certain_divides_by_no_zero_and_clips_no_infinity(release
     exact = {"observed": seen, "values": np.full((2, 19, 2), 20.0), "sigma": np.zeros(2)}
     run(walk, episodes, range(2), **exact)
     found = walk.estimate()
-    speed = 20.0 if release == "speed" else episodes.model.reference_speed + 20.0 / 20.0
+    speed = 20.0 if release == "speed" else episodes.model.centre + 20.0 / 20.0
     np.testing.assert_allclose(found.density, 20.0)
     np.testing.assert_allclose(found.speed, speed)
     np.testing.assert_array_equal(walk.innovations, 0.0)

@@ -23,7 +23,7 @@ def test_measures_density_and_speed_of_segments_or_averages_of_flows_around_a_ce
     np.testing.assert_allclose(model.density(states), density)
     np.testing.assert_allclose(model.speed(states), speed, atol=1e-9)
     np.testing.assert_array_equal(model.measurement_scale, [scale, model.speed_scale])
-    flows = ARZModel(HIGHWAY.road, parameters, reference_speed=51.0, channels=CHANNELS)
+    flows = ARZModel(HIGHWAY.road, parameters, centre=51.0, channels=CHANNELS)
     for given, v_0 in ((None, 51.0), (centre, centre)):
         expected = flows.averages(np.stack([density, density * (speed - v_0)], axis=-1))
         np.testing.assert_allclose(flows.measure(states, given), expected, rtol=1e-9, atol=1e-6)
@@ -39,7 +39,7 @@ def test_measures_density_and_speed_of_segments_or_averages_of_flows_around_a_ce
 def test_the_measurement_matrix_is_that_of_central_differences(parameters, release, demand):
     speed = None if release == "speeds" else 51.0
     model = ARZModel(
-        HIGHWAY.road, parameters, reference_speed=speed,
+        HIGHWAY.road, parameters, centre=speed,
         channels=CHANNELS if release == "rows" else None, demand_states=demand,
     )  # fmt: skip
     rng, floor = np.random.default_rng(1), MEASUREMENT_FLOOR * model.jam_density
@@ -59,8 +59,8 @@ def test_the_measurement_matrix_is_that_of_central_differences(parameters, relea
 
 def test_impossible_sensors_are_refused():
     for bad in (-1.0, np.nan, np.inf, "fast"):
-        with pytest.raises(ValueError, match=r"model\.reference_speed must be .*, got "):
-            ARZModel(HIGHWAY.road, PAPER, reference_speed=bad)
+        with pytest.raises(ValueError, match=r"model\.centre must be .*, got "):
+            ARZModel(HIGHWAY.road, PAPER, centre=bad)
     with pytest.raises(ValueError, match=r"model\.channels must be segments"):
         ARZModel(HIGHWAY.road, W99, channels=CHANNELS)  # mean speeds have no sum
 

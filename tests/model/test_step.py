@@ -89,7 +89,7 @@ def test_a_batch_equals_a_loop_a_copy_and_a_kernel_that_overwrites_its_state_to_
 )
 def test_a_kernels_channel_is_the_models_measurement_linearised(road, channels, speed, demand):
     """Empty segments and negative densities among them, as a filter may have."""
-    model = ARZModel(road.road, W99, reference_speed=speed, channels=channels, demand_states=demand)
+    model = ARZModel(road.road, W99, centre=speed, channels=channels, demand_states=demand)
     rng = np.random.default_rng(2)
     states = scattered_states(model, 20, rng)
     assert (model.components(states)[0] < 0.0).any(axis=0).mean() > 0.8

@@ -42,5 +42,5 @@ def test_a_model_has_the_channels_and_the_centre_of_the_task():
     model, expected = make_model(config), make_task(config)
     np.testing.assert_array_equal(model.channels.first, expected.channels.first)
     np.testing.assert_array_equal(model.channels.span, expected.channels.span)
-    assert model.reference_speed == expected.flow_centre == 0.5 * config.corridor.speed_limit
+    assert model.centre == expected.centre == 0.5 * config.corridor.speed_limit
     assert not task(preset=MeanRelease).releases_flow

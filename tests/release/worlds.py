@@ -48,7 +48,7 @@ def streams(*seeds):
 def task_of(model, settings, road, queries, n_episodes=1, groups=WHOLE):
     """What a release model of a class measures of a road in a batch of episodes."""
     return Task(
-        settings.preset, settings, road, queries, road.duration, model.flow_centre(road, settings),
+        settings.preset, settings, road, queries, road.duration, model.centre(road, settings),
         model.has_prices, n_episodes, groups,
     )  # fmt: skip
 
