@@ -19,8 +19,10 @@ from dptse_env.evaluation import WARM_UP
 from dptse_env.importers.fields import FieldSource, by_second
 from dptse_env.parts import make_model, make_release
 from dptse_env.traffic import Corridor, Demand
+from dptse_env.traffic.roads import DENSITY_SCALE
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import require
+from dptse_env.utils.units import HOUR
 
 
 class Field(NamedTuple):
@@ -64,7 +66,7 @@ def read_field(source: FieldSource, segments: int, lanes: int, speed_limit: floa
 def field_corridor(field: Field, lanes: int, speed_limit: float) -> Corridor:
     """Return a straight road for a field; scales grow with lanes and limit as on other roads."""
     n = field.density.shape[1] - 2
-    dwell = 3600.0 * field.segment_length / float(field.speed[:, 1:-1].mean())
+    dwell = HOUR * field.segment_length / float(field.speed[:, 1:-1].mean())
     return Corridor(
         name="measured-field",
         n_mainline=n,
@@ -78,7 +80,7 @@ def field_corridor(field: Field, lanes: int, speed_limit: float) -> Corridor:
         lanes=lanes,
         segment_length=field.segment_length,
         speed_limit=speed_limit,
-        density_scale=111.0 * lanes,
+        density_scale=DENSITY_SCALE * lanes,
         speed_scale=speed_limit,
         average_dwell=dwell,
     )

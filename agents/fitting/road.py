@@ -20,7 +20,7 @@ from dptse_env.config import (
 )
 from dptse_env.evaluation import WARM_UP
 from dptse_env.model import available_parameters
-from dptse_env.model.parameters import LARGEST_W, SECONDS_PER_HOUR
+from dptse_env.model.parameters import LARGEST_W
 from dptse_env.traffic import (
     Corridor,
     RecordLibrary,
@@ -33,6 +33,7 @@ from dptse_env.traffic import (
 from dptse_env.traffic.imported import has_vehicles, recorded_seeds
 from dptse_env.traffic.sumo_input import network_xml
 from dptse_env.utils.fields import read_json, require
+from dptse_env.utils.units import HOUR
 from dptse_env.versions import code_version
 
 CHOSEN = ("parameters", "estimator", "estimator_settings")
@@ -203,7 +204,7 @@ def _check_road(path: Path, corridor: Corridor) -> None:
         network_xml(corridor)  # so that netconvert refuses the road, or is missing, at once
     pairs = zip(corridor.segment_lengths, corridor.speed_limits, strict=True)
     for segment, (length, limit) in enumerate(pairs):
-        least = LARGEST_W * limit / SECONDS_PER_HOUR
+        least = LARGEST_W * limit / HOUR
         if length < 1.02 * least:
             raise ValueError(
                 f"{path}: segment {segment} of {length:g} km must be longer than "

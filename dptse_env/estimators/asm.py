@@ -14,8 +14,9 @@ traffic, m = (1 + tanh((V - v) / dV)) / 2 with v = min(v_free, v_jam):
 
 Densities are smoothed per lane, along the mainline and along each ramp for itself: smoothed into
 each other, errors of the mainline are up to a half larger. A released flow becomes a speed,
-centre + flow / density, by the density estimated before it; where that is below `LEAST_DENSITY`,
-vehicles at the speed limit are added up to it. Neighbours further away than `REACH` s are left out.
+centre + flow / density, by the density estimated before it; where that is below
+`LEAST_LANE_DENSITY`, vehicles at the speed limit are added up to it. Neighbours further away than
+`REACH` s are left out.
 What the model's inputs say of the ends of the road are values as well, half a segment beyond it:
 behind an exit drivers keep their w = v + p(rho). The prior is a value of second 0.
 
@@ -58,15 +59,15 @@ from dptse_env.estimators.settings import AdaptiveSmoothingSettings, EstimatorSe
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
 from dptse_env.model.arrays import ARZ, Channels
-from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.model.step import pressure
 from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, all_finite, kernel, kernel_part
+from dptse_env.utils.units import HOUR
 
 REACH = 3.0
 """Distance of the furthest neighbours, in s: they weigh a twentieth of the place itself."""
-LEAST_DENSITY = 15.0
+LEAST_LANE_DENSITY = 15.0
 """Density of a lane [veh/km] below which a flow is mostly noise."""
 LEAST_WEIGHT = 1e-100
 FREE, JAM = 0, 1
@@ -78,7 +79,7 @@ SPEED_MODEL = 310.0, 0.4
 STALE_VARIANCE = 30.0**2, 40.0**2
 """Coefficients c [(veh/km)^2, (km/h)^2]: variances of traffic that nothing is known of."""
 STALE = 60.0
-MEMORY, CONFIDENCE = 300.0, 0.3
+FACTOR_MEMORY, CONFIDENCE = 300.0, 0.3
 """Seconds in which the factors forget, and K: how many innovations without noise k = 1 is worth."""
 LARGEST_FACTOR = 10.0
 """Range of the factors from 1 on: calm traffic does not make the next jam known."""
@@ -128,7 +129,7 @@ def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stenci
             spatial = math.exp(-abs(distance) / settings.length)
             for wave, speed in ((FREE, settings.free_wave), (JAM, -settings.jam_wave)):
                 # A wave arrives late downstream of the place if it is free, else upstream.
-                lag = SECONDS_PER_HOUR * distance / speed
+                lag = HOUR * distance / speed
                 if lag > 0.0:
                     factors = _factors(lag, settings.time, step, spatial)
                     found.append((int(lag / step), target, wave, factors))
@@ -151,7 +152,7 @@ def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stenci
         transition=float(settings.transition),
         largest_speed=float(model.largest_speed),
         step=float(step),
-        forgetting=math.exp(-step / MEMORY),
+        forgetting=math.exp(-step / FACTOR_MEMORY),
         boundary_weight=float(settings.boundary_weight),
     )
 
@@ -424,7 +425,7 @@ def _read_channel(
         rho += share * density
         rho_variance += (share * present[s, 2]) ** 2
         rho_smoothed += share**2 * state.smoothed[e, s, 0]
-        floored = max(density, LEAST_DENSITY * road.lanes[s])
+        floored = max(density, LEAST_LANE_DENSITY * road.lanes[s])
         by_speed, slip = 1.0, 0.0
         if stencil.flows:
             by_speed, slip = floored, speed - centre[s]

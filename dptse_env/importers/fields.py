@@ -40,23 +40,24 @@ from dptse_env.utils.fields import (
     require_name,
 )
 from dptse_env.utils.files import require_output
+from dptse_env.utils.units import HOUR
 
 UNITS = {
     "density": {f"veh/{name}": 1.0 / LENGTHS[name] for name in ("km", "mi", "ft", "m")},
     "speed": SPEEDS,
-    "flow": {f"veh/{name}": 3600.0 / factor for name, factor in TIMES.items() if factor >= 1.0},
+    "flow": {f"veh/{name}": HOUR / factor for name, factor in TIMES.items() if factor >= 1.0},
 }
 """Factors to veh/km, km/h and veh/h."""
 USUAL = {"density": "veh/km", "speed": "km/h", "flow": "veh/h"}
 """Units where none is given."""
-LEAST_DENSITY = 1e-9
+VACANT = 1e-9
 """Density [veh/km] below which a cell is empty and has no speed of its own."""
 FULL, LIGHT, EMPTY = 200.0, 10.0, 0.1
 """Densities of a lane [veh/km]: bumper to bumper, so light that vehicles drive freely, and so
 light that a speed says nothing."""
 BUSIEST = 4000.0
 """Flow of a lane [veh/h] that none exceeds."""
-FASTEST, SLOWEST = 200.0, 5.0
+FEW_ABOVE, SOME_ABOVE = 200.0, 5.0
 """Speeds [km/h] that few exceed, and that some do."""
 FEW = 0.01
 """Share of the cells that noise may put beyond these limits; more are a sign of another unit."""
@@ -187,7 +188,7 @@ class FieldSource:
         require(lasts <= LONGEST_FIELD, str(self.density), allowed, f"{lasts:g} s")
         self._check_unit("density", lambda factor: _odd_density(factor * density, lanes))
         occupied = density > EMPTY * lanes
-        speed = (other if kind == "speed" else other / np.maximum(density, LEAST_DENSITY))[occupied]
+        speed = (other if kind == "speed" else other / np.maximum(density, VACANT))[occupied]
         light = speed[density[occupied] < LIGHT * lanes]
         self._check_unit(kind, lambda f: _odd_speed(f * speed, f * light, speed_limit))
         self._check_values(density, other, lanes)
@@ -252,8 +253,8 @@ class FieldSource:
 
         Tables are of shape (cells, intervals). A speed where nobody is counts for nothing.
         """
-        fastest = self.speed, 2.0 * FASTEST, "km/h", other * (density > 0.0)
-        busiest = self.flow, 2.0 * lanes * max(BUSIEST, 3600.0 / self.interval), "veh/h", other
+        fastest = self.speed, 2.0 * FEW_ABOVE, "km/h", other * (density > 0.0)
+        busiest = self.flow, 2.0 * lanes * max(BUSIEST, HOUR / self.interval), "veh/h", other
         fullest = self.density, 2.0 * lanes * max(FULL, 1.0 / self.cell), "veh/km", density
         for path, most, unit, table in (fullest, fastest if self.speed else busiest):
             beyond = table > most
@@ -288,7 +289,7 @@ class FieldSource:
         such cell, and `sides` is 1, the other must have its usual flow, and not that of a ramp.
         """
         found = np.zeros_like(still)
-        density, flow = np.nan_to_num(density), np.nan_to_num(flow) * self.interval / 3600.0
+        density, flow = np.nan_to_num(density), np.nan_to_num(flow) * self.interval / HOUR
         moving = (density > 0.0) & (flow > 0.0)
         at_most = np.append(0.0, flow.max(axis=0).cumsum())
         for cell in np.flatnonzero(still.any(axis=1)):
@@ -407,7 +408,7 @@ def _conservation(density: FloatArray, flow: FloatArray, cell: float, interval: 
     Blocks are as long as half the way that vehicles drive in their time.
     """
     j = math.ceil(BLOCK_TIME / interval)
-    speed = flow.sum() / max(density.sum(), LEAST_DENSITY)
+    speed = flow.sum() / max(density.sum(), VACANT)
     i = max(1, math.ceil(speed * j * interval / 7200.0 / cell))
     c, t = len(density) // i, density.shape[1] // j
     if c < 3 or t < 3 or (c - 2) * (t - 2) < FEWEST_BLOCKS:
@@ -415,7 +416,7 @@ def _conservation(density: FloatArray, flow: FloatArray, cell: float, interval: 
     k, q = (
         each[: c * i, : t * j].reshape(c, i, t, j).mean(axis=(1, 3)) for each in (density, flow)
     )
-    stays = 3600.0 * (k[1:-1, 2:] - k[1:-1, :-2]) / (j * interval)
+    stays = HOUR * (k[1:-1, 2:] - k[1:-1, :-2]) / (j * interval)
     leaves = (q[2:, 1:-1] - q[:-2, 1:-1]) / (i * cell)
     all_changes = stays.var() + leaves.var()
     if all_changes == 0.0:
@@ -434,10 +435,10 @@ def _odd_density(density: FloatArray, lanes: int) -> str | None:
 
 def _odd_speed(speed: FloatArray, light: FloatArray, speed_limit: float) -> str | None:
     """Return what says that speeds [km/h], or those in light traffic, are of another unit."""
-    above = float((speed > FASTEST).mean()) if speed.size else 0.0
+    above = float((speed > FEW_ABOVE).mean()) if speed.size else 0.0
     if above > FEW:
-        return f"{100 * above:.0f} % of speeds are above {FASTEST:g} km/h"
-    if speed.size and speed.max() < SLOWEST:
+        return f"{100 * above:.0f} % of speeds are above {FEW_ABOVE:g} km/h"
+    if speed.size and speed.max() < SOME_ABOVE:
         return f"no speed is above {speed.max():.2g} km/h"
     usual = float(np.median(light)) if light.size > FEW * speed.size else speed_limit
     if usual >= SLOW * speed_limit:
@@ -541,4 +542,4 @@ def by_second(
         np.column_stack([np.interp(seconds, middles, row) for row in table])
         for table in (t[: n * each].reshape(n, each, -1).mean(axis=1) for t in (density, flow))
     )
-    return rho, q / np.maximum(rho, LEAST_DENSITY)
+    return rho, q / np.maximum(rho, VACANT)

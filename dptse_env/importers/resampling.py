@@ -14,10 +14,11 @@ from dptse_env.importers.source import Source, TrajectoryError
 from dptse_env.importers.units import Motion, check_units
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.fields import shown
+from dptse_env.utils.units import HOUR
 
 TIME_UNIT = 1e-4
 """Times are rounded to this [s]: sums of frame lengths are not whole in floating point."""
-FASTEST = 300.0 / 3600.0
+FASTEST_MOVE = 300.0 / HOUR
 """Distance a second that no vehicle exceeds [km/s]; more is a jump to another place."""
 JUMP = 0.05
 """Distance that noise may add, forwards or backwards [km]."""
@@ -111,7 +112,7 @@ def whole_seconds(
 
 
 def _too_far(move: pl.Expr, wait: pl.Expr) -> pl.Expr:
-    return move > FASTEST * wait + JUMP
+    return move > FASTEST_MOVE * wait + JUMP
 
 
 def _backwards(move: pl.Expr) -> pl.Expr:
@@ -185,7 +186,7 @@ def _tracks(points: pl.DataFrame, longest_gap: float, where: str) -> IntArray:
                 best = -1
                 break
             away = abs(move - v * wait) + SAME_PLACE * (lane != on)
-            if wait > 0.0 and -JUMP <= move <= FASTEST * wait + JUMP and away < nearest:
+            if wait > 0.0 and -JUMP <= move <= FASTEST_MOVE * wait + JUMP and away < nearest:
                 best, nearest = number, away
         found[i] = best
         if best == n:
@@ -310,7 +311,7 @@ def _derived(points: pl.DataFrame, place: IntArray, second: IntArray) -> FloatAr
     axis, shift = time + offset[piece], offset[piece[place]]
     moved = np.interp(end + shift, axis, position) - np.interp(start + shift, axis, position)
     none = np.full(len(place), np.nan)
-    speed: FloatArray = np.divide(3600.0 * moved, end - start, none, where=end > start)
+    speed: FloatArray = np.divide(HOUR * moved, end - start, none, where=end > start)
     return speed
 
 
@@ -319,7 +320,7 @@ def _pieces(points: pl.DataFrame, counts: Counter[str]) -> pl.DataFrame:
     c = pl.col
     mean = 0.5 * (c("next_speed") + c("speed"))
     # As its speeds say, by the trapezoidal rule.
-    driven = pl.when("joined").then(mean * c("wait") / 3600.0).otherwise(0.0)
+    driven = pl.when("joined").then(mean * c("wait") / HOUR).otherwise(0.0)
     pieces = points.group_by("chain", maintain_order=True).agg(
         group=c("group").first(), begin=c("time").first(), end=c("time").last(),
         enters=c("column").first(), leaves=c("column").last(), n=c("n").sum(), n_points=pl.len(),
@@ -386,7 +387,7 @@ def check_pieces(
         pieces.filter(time > 0.0)
         .select(
             step=(time / (pl.col("n_points") - 1)).median(),
-            speed=(3600.0 * pl.col("move") / time).median(),
+            speed=(HOUR * pl.col("move") / time).median(),
             ratio=pl.col("ratio").drop_nans().median(),
         )
         .row(0)

@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 
 from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES, UNITS, Source, TrajectoryError
+from dptse_env.utils.units import HOUR
 
 SAMPLE = 100_000
 """Rows at the start of a file by which units are checked before points are placed."""
@@ -105,8 +106,8 @@ def motion(points: pl.DataFrame, source: Source, time_unit: float) -> Motion | N
     step = float(np.median(steps["wait"].to_numpy()))
     return Motion(
         step,
-        float(np.median(3600.0 * moves / waits)),
-        float(np.median(driven / moves / 3600.0)) if vehicles["has_speed"].all() else None,
+        float(np.median(HOUR * moves / waits)),
+        float(np.median(driven / moves / HOUR)) if vehicles["has_speed"].all() else None,
         bool(abs(step / time_unit - 1.0) < 1e-6 and np.all(numbers == np.round(numbers))),
     )
 

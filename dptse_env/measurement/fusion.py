@@ -12,10 +12,10 @@ from typing import Annotated
 import numpy as np
 
 from dptse_env.estimators import Estimate, Measurement
-from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.release import Task
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.units import HOUR
 
 LEAST_SPEED = 5.0
 """Speed from which on the time on a segment does not grow any more [km/h]."""
@@ -108,5 +108,5 @@ class Fusion:
         factor = self.settings.dwell_factor
         if factor == 0.0:
             return 1.0
-        dwell = SECONDS_PER_HOUR * length / np.maximum(speed, LEAST_SPEED)
+        dwell = HOUR * length / np.maximum(speed, LEAST_SPEED)
         return np.maximum(factor * dwell, 1.0)

@@ -21,7 +21,6 @@ from dptse_env.model.parameters import (
     LEAST_FACTOR,
     LEAST_W,
     MEASUREMENT_FLOOR,
-    SECONDS_PER_HOUR,
     VACUUM,
     ARZParameters,
     Bounds,
@@ -30,6 +29,7 @@ from dptse_env.model.step import jacobians, next_states, write_inputs
 from dptse_env.road import Road
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import non_negative
+from dptse_env.utils.units import HOUR
 
 
 class ARZModel:
@@ -101,7 +101,7 @@ class ARZModel:
             self.centre = non_negative("model.centre", centre)
             second = self.density_scale * self.speed_scale
         self.measurement_scale: FloatArray = np.array([self.density_scale, second])
-        step_ratio = time_step / SECONDS_PER_HOUR / road.lengths[: self.n_segments]
+        step_ratio = time_step / HOUR / road.lengths[: self.n_segments]
         self.arz = ARZ(
             free_flow_speed=float(parameters.free_flow_speed),
             gamma=float(parameters.gamma),

@@ -21,8 +21,8 @@ from dptse_env.utils.fields import (
     require_name,
     within,
 )
+from dptse_env.utils.units import HOUR
 
-SECONDS_PER_HOUR = 3600.0
 LARGEST_W = 1.1
 """Largest w of a physical state, in units of v_f."""
 
@@ -84,7 +84,7 @@ class ARZParameters:
         Forwards, no cell sends more than it holds: (T/l) w <= 1 - T/tau up to w = 1.1 v_f.
         Backwards, no wave crosses more than a cell; the fastest, gamma v_f, runs out of a jam.
         """
-        crossing = SECONDS_PER_HOUR * segment_length / self.free_flow_speed
+        crossing = HOUR * segment_length / self.free_flow_speed
         forwards = 1.0 / (LARGEST_W / crossing + 1.0 / self.relaxation_time)
         return min(forwards, crossing / self.gamma)
 
@@ -97,7 +97,7 @@ class ARZParameters:
         if not (time_step > 0.0 and share > 0.0):
             return math.inf
         waves = max(LARGEST_W / share, self.gamma) * self.free_flow_speed
-        return math.ceil(1e4 * time_step * waves / SECONDS_PER_HOUR) / 1e4
+        return math.ceil(1e4 * time_step * waves / HOUR) / 1e4
 
     def require_time_step(
         self, time_step: float, length: float, field: str = "segment_length"

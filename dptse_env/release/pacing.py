@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.model.parameters import SECONDS_PER_HOUR
 from dptse_env.release.queries import QueryOptions
 from dptse_env.release.task import Task
 from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
+from dptse_env.utils.units import HOUR
 
 MEAN_SQUARE = 0.15
 """Expected value of d^2 / D^2, by which a contribution costs more than its price."""
@@ -25,13 +25,13 @@ MEAN_SQUARE = 0.15
 LEAST_SHARE = 0.01
 """Least part of the budget that is offered for the rest of a trip, so that prices stay positive."""
 
-SLOWEST, FASTEST = 8.0, 102.0
+SLOWEST_TRIP, FASTEST_TRIP = 8.0, 102.0
 """Range that predicted speeds [km/h] are held to where they give the time of a trip."""
 
 MARGIN = 2.0
 """Queried seconds added to those that are expected for the rest of a trip [s]."""
 
-MEMORY = 60.0
+RATE_MEMORY = 60.0
 """Time constant of the average by which rates of querying follow the queries [s]."""
 
 
@@ -136,7 +136,7 @@ class TripPacing(Pacing):
         """Return prices at the upstream end, at these speeds and the rates of the beginning."""
         road = self.task.corridor.road
         n, length = road.n_mainline, road.lengths[: road.n_mainline]
-        seconds = SECONDS_PER_HOUR * length / np.clip(speed[:n], SLOWEST, FASTEST)
+        seconds = HOUR * length / np.clip(speed[:n], SLOWEST_TRIP, FASTEST_TRIP)
         queried = (self._first_rates[:, :n] * seconds).sum(axis=1) + MARGIN
         prices: FloatArray = self._paces.offered / queried
         return prices
@@ -228,7 +228,7 @@ def _pace(
             for s in range(n_cells):
                 paid[s] += charge * charged[s]
                 seen = 1.0 if charged[s] > 0.0 else 0.0
-                rate[s] += (seen - rate[s]) / MEMORY
+                rate[s] += (seen - rate[s]) / RATE_MEMORY
 
 
 @kernel_part
@@ -257,7 +257,7 @@ def _carry(
             after[cell] *= 1.0 - _moved(road.lengths[s], speed[s])
     for s in range(road.n_segments):
         if flow[s] > 0.0:
-            arrived = flow[s] / (SECONDS_PER_HOUR * road.lengths[s] * max(density[s], 1e-9))
+            arrived = flow[s] / (HOUR * road.lengths[s] * max(density[s], 1e-9))
             share = min(arrived, 1.0)
             after[s] = (1.0 - share) * before[s] + share * mass[s] / flow[s]
     for e in range(road.exits.size):
@@ -270,7 +270,7 @@ def _carry(
 @kernel_part
 def _moved(length: float, speed: float) -> float:
     """Return the share of the vehicles on a length [km] that leave it in a second."""
-    return float(min(speed / (SECONDS_PER_HOUR * length), 1.0))
+    return float(min(speed / (HOUR * length), 1.0))
 
 
 @kernel_part
@@ -299,7 +299,7 @@ def _remaining(road: Road, speed: FloatArray, rate: FloatArray, rest: FloatArray
 @kernel_part
 def _seconds(length: float, speed: float) -> float:
     """Return the time [s] on a length [km] at a speed [km/h]."""
-    return float(SECONDS_PER_HOUR * length / min(max(speed, SLOWEST), FASTEST))
+    return float(HOUR * length / min(max(speed, SLOWEST_TRIP), FASTEST_TRIP))
 
 
 @kernel

@@ -4,6 +4,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from dptse_env.model.parameters import LEAST_DENSITY
 from dptse_env.parts import QueryInterface
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import ProcessSchedule, Schedule
@@ -269,10 +270,6 @@ class SpeedFront(Schedule):
         value = (AGE_CAP * age + 1.0) ** self.age_power * surprise
         value *= (np.abs(before - after) + self.least_front) * (speed + self.least_speed)
         return self.highest(value * np.linspace(2.0, 1.0, n), step)
-
-
-LEAST_DENSITY = 1.0
-"""Density [veh/km] by which the noise of a flow is divided at least."""
 
 
 class ExpectedReduction(ProcessSchedule):

@@ -36,14 +36,15 @@ from dptse_env.traffic.sumo_input import NetworkError
 from dptse_env.utils.fields import integer, require
 from dptse_env.utils.files import require_writable
 from dptse_env.utils.threads import n_cores
+from dptse_env.utils.units import HOUR
 
 CACHE_VARIABLE = "DPTSE_CACHE"
 """Environment variable with the directory of the records; errors name it."""
 
-MEMORY = 2**28
+IN_MEMORY = 2**28
 """Size of the records that a library keeps in memory [bytes], if nothing else is said."""
 
-LEFTOVER_AGE = 6 * 3600.0
+LEFTOVER_AGE = 6 * HOUR
 """Age [s] at which a hidden file is considered abandoned. Writing takes a second."""
 
 RECORDED = 2000.0
@@ -77,7 +78,7 @@ class RecordLibrary:
         ValueError: `memory` is negative.
     """
 
-    def __init__(self, path: str | os.PathLike[str] | None = None, memory: int = MEMORY) -> None:
+    def __init__(self, path: str | os.PathLike[str] | None = None, memory: int = IN_MEMORY) -> None:
         """Store the path; nothing is read or written yet."""
         self.is_default = path is None
         self.path = default_path() if path is None else Path(path).expanduser()

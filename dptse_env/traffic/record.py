@@ -18,6 +18,7 @@ from dptse_env.traffic.corridor import Corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.fields import integer, require
 from dptse_env.utils.files import read_tensors, write_tensors
+from dptse_env.utils.units import HOUR
 
 RECORD_FORMAT = "dptse-record"
 RECORD_VERSION = 2
@@ -311,7 +312,7 @@ def _dwell(record: Record, corridor: Corridor) -> tuple[float, float]:
     if record.field is not None:
         vehicles = record.field[:, :n, 0] * np.array(corridor.segment_lengths[:n])
         passing = record.field[:, :n].prod(axis=-1)
-        return float(vehicles.sum()), float(passing.sum()) / 3600.0
+        return float(vehicles.sum()), float(passing.sum()) / HOUR
     mainline = record.segment < n
     step, vehicle, segment = (
         column[mainline].astype(np.int64)

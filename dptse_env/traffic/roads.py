@@ -26,6 +26,7 @@ from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, Incid
 from dptse_env.utils.fields import from_mapping, read_toml, require, within
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.registry import Registry, require_registered
+from dptse_env.utils.units import HOUR
 
 SUFFIX = ".toml"
 """Ending of the name of a road file."""
@@ -244,7 +245,7 @@ def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[s
     corridor = from_mapping(Corridor, fields, "corridor")
     n = corridor.n_mainline
     crossings = [
-        3600.0 * length / limit
+        HOUR * length / limit
         for length, limit in zip(corridor.segment_lengths, corridor.speed_limits, strict=True)
     ]
     derived = {

@@ -18,6 +18,7 @@ from dptse_env.traffic.demand import (
     value_at,
 )
 from dptse_env.utils.fields import integer
+from dptse_env.utils.units import HOUR
 
 MAINLINE = -1
 """Origin or exit of a vehicle that enters or leaves by the mainline instead of a ramp."""
@@ -107,7 +108,7 @@ def _arrivals(
         ends = [*(time for time, _ in profile[1:]), duration]
         for (start, rate), end in zip(profile, ends, strict=True):
             length = max(min(end, duration) - start, 0.0)
-            count = int(generator.poisson(rate * length / 3600.0))
+            count = int(generator.poisson(rate * length / HOUR))
             times.append(start + length * generator.random(count))
             origins.append(np.full(count, origin, dtype=np.int64))
     # SUMO's clock counts milliseconds; rounding here keeps its files and this array the same.

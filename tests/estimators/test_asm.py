@@ -9,9 +9,9 @@ from dptse_env.estimators import AdaptiveSmoothingSettings, EstimatorSettings
 from dptse_env.estimators.asm import (
     CONFIDENCE,
     DENSITY_MODEL,
+    FACTOR_MEMORY,
     LARGEST_FACTOR,
-    LEAST_DENSITY,
-    MEMORY,
+    LEAST_LANE_DENSITY,
     REACH,
     SPEED_MODEL,
     STALE,
@@ -120,7 +120,7 @@ class Textbook:
             ends.append((s, self.x[s] + road.lengths[s], rho / lanes, v))
         for s, x, rho, v in ends:
             self.values.append((self.chain[s], x, self.t, weight, np.array([rho, v]), np.zeros(2)))
-        self.evidence = CONFIDENCE + np.exp(-model.time_step / MEMORY) * (
+        self.evidence = CONFIDENCE + np.exp(-model.time_step / FACTOR_MEMORY) * (
             self.evidence - CONFIDENCE
         )
         self.evaluate()
@@ -131,7 +131,7 @@ class Textbook:
         S = model.n_segments
         lanes, flows = model.road.lanes[:S], model.centre is not None
         density, speed, density_std, speed_std = self.now.T
-        floored = np.maximum(density, LEAST_DENSITY * lanes)
+        floored = np.maximum(density, LEAST_LANE_DENSITY * lanes)
         evidence = self.evidence.copy()
         for m in np.flatnonzero(observed):
             H = model.averaging[m]

@@ -15,6 +15,7 @@ import numpy as np
 
 from dptse_env.traffic import Corridor, Demand
 from dptse_env.traffic.record import Record
+from dptse_env.traffic.roads import DENSITY_SCALE
 from dptse_env.utils.arrays import AnyArray, FloatArray
 
 LANES, LIMIT = 3, 105.0
@@ -41,7 +42,7 @@ def road() -> Corridor:
         name="idm", n_mainline=N, on_ramps=(), off_ramps=(), exit_shares=(),
         demand=Demand(mainline=((0.0, 4500.0),)), incident=None, fixed_sensors=(),
         duration=DURATION, lanes=LANES, segment_length=WIDTH / 1000.0, speed_limit=LIMIT,
-        density_scale=111.0 * LANES, speed_scale=LIMIT,
+        density_scale=DENSITY_SCALE * LANES, speed_scale=LIMIT,
     )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from dptse_env.traffic.sumo import RecordingError
 from dptse_env.utils.arrays import BoolArray, IntArray
 from dptse_env.utils.fields import require
 from dptse_env.utils.files import file_digest
+from dptse_env.utils.units import HOUR
 
 NEVER = np.iinfo(np.int64).max
 """First step of a vehicle on a column where it never is."""
@@ -191,7 +192,7 @@ def _demand(corridor: Corridor, first: IntArray) -> Demand:
 
     def rates(steps: IntArray) -> Profile:
         counts, _ = np.histogram(steps[(steps > 0) & (steps < NEVER)], times)
-        hourly = 3600.0 * counts / np.diff(times)
+        hourly = HOUR * counts / np.diff(times)
         pairs = zip(times[:-1], hourly, strict=True)
         return tuple((float(time), round(float(rate), 1)) for time, rate in pairs)
 

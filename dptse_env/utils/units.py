@@ -1,0 +1,4 @@
+"""Units: lengths are in km, speeds in km/h, flows in veh/h, and times in seconds."""
+
+HOUR = 3600.0
+"""An hour [s]."""
