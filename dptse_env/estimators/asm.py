@@ -317,6 +317,7 @@ def _sum(stencil: Stencil, past: FloatArray, place: int, sums: FloatArray) -> No
         # Sums of P over the ages up to a, the latest of the least weight.
         w, x, y, n, o = 0.0, 0.0, 0.0, 0.0, 0.0
         for q in range(stencil.first[j], stencil.first[j + 1]):
+            # sum_{a=1..f} (1 - r^2) r^{f-a} P_{t-a}
             while a < stencil.delay[q]:
                 a += 1
                 t = t - 1 if t > 0 else H - 1
@@ -325,6 +326,7 @@ def _sum(stencil: Stencil, past: FloatArray, place: int, sums: FloatArray) -> No
                 y = r * y + (1.0 - r2) * own[t, 2]
                 n = r2 * n + (1.0 - r2 * r2) * own[t, 3]
                 o = r2 * o + (1.0 - r2 * r2) * own[t, 4]
+            # with the factors of P_t, of this sum and of P_{t-f-1}
             old = own[t - 1 if t > 0 else H - 1]
             out, f = sums[stencil.target[q], stencil.wave[q]], stencil.weight[q]
             out[0] += f[0, 0] * now[0] + f[0, 1] * w + f[0, 2] * old[0]
@@ -340,8 +342,10 @@ def _evaluate(road: Road, arz: ARZ, stencil: Stencil, state: State, e: int) -> N
     sums, present, smoothed = state.sums[e], state.present[e], state.smoothed[e]
     for s in range(road.n_segments):
         free, jam, lanes = sums[s, FREE], sums[s, JAM], road.lanes[s]
+        # z_c = sum phi_c z_j / sum phi_c
         by_free, by_jam = 1.0 / free[WEIGHT], 1.0 / jam[WEIGHT]
         v_free, v_jam = by_free * free[SPEED], by_jam * jam[SPEED]
+        # m = (1 + tanh((V - v) / dV)) / 2 and z = m z_jam + (1 - m) z_free
         m = stencil.threshold - min(v_free, v_jam)
         m = 0.5 + 0.5 * math.tanh(m / stencil.transition)
         by_free, by_jam = (1.0 - m) * by_free, m * by_jam
@@ -349,6 +353,7 @@ def _evaluate(road: Road, arz: ARZ, stencil: Stencil, state: State, e: int) -> N
         gap = lanes * (jam[DENSITY] / jam[WEIGHT] - free[DENSITY] / free[WEIGHT])
         present[s, 0] = rho = min(max(rho, 0.0), arz.jam[s])
         present[s, 1] = min(max(m * v_jam + (1.0 - m) * v_free, 0.0), stencil.largest_speed)
+        # a_1 n^(1/2) / l^2 + a_2 (rho_jam - rho_free)^2 and b_1 / (1 + n) + b_2 (v_jam - v_free)^2
         length = road.lengths[s]
         vehicles = rho * length
         flicker = DENSITY_MODEL[0] * math.sqrt(vehicles) / length**2
@@ -444,6 +449,7 @@ def _read_channel(
         state.innovations[e, m, i] = error / math.sqrt(variance)
         smoothed = rho_smoothed if i == 0 else y_smoothed
         for s in range(first, first + span):
+            # k = (K + sum M (e^2 - noise) / (noise + M)^2) / (K + sum M^2 / (noise + M)^2)
             evidence = state.evidence[e, s, i]
             known = variance - _factor(evidence) * smoothed
             gain = smoothed / (known + smoothed) ** 2

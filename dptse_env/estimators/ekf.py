@@ -122,7 +122,7 @@ class Linearised(NamedTuple):
 
 @kernel
 def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
-    """Predict one step ahead under inputs `(k, n_u)`: x = f(x, u), P = F P F' + Q."""
+    """Predict one step ahead under inputs `(k, n_u)`."""
     road, arz, _, filters = bundle.parts
     scratch, noise = make_scratch(road), np.empty(filters.units.size)
     blocks = np.empty((*road.neighbours.shape, 4))
@@ -130,9 +130,11 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     for k in range(episodes.size):
         mean, covariance = filters.means[episodes[k]], filters.covariances[episodes[k]]
         process_noise(road, filters, mean, noise)
+        # x = f(x, u) and A = df/dx
         advance(road, arz, mean, inputs[k], mean, blocks, scratch)
         project(road, arz, mean, filters.is_box)
         normalise(arz, filters.units[0], blocks, scratch.by_factor)
+        # P = A P A' + Q
         mirror(covariance)
         propagate(road, blocks, scratch.by_factor, noise, covariance, work, covariance)
 
@@ -214,7 +216,7 @@ def _innovate(
             continue
         first, size = 2 * channels.first[m], 2 * channels.span[m]
         for q in range(2):
-            variance = linear.noise[m, q]
+            variance = linear.noise[m, q]  # S = R + h' P h
             for i in range(size):
                 along = 0.5 * linear.weights[m, q, i] * covariance[first + i, first + i]
                 for j in range(i):
@@ -256,6 +258,7 @@ def _assimilate(
         weights = linear.weights[m, :, :size]
         if not pair_update(covariance, first, weights, linear.noise[m], work):
             return False
+        # x = x + K_q (z_q - h_q(x_0) - h_q' (x - x_0)), by one number q after the other
         for q in range(2):
             residual = linear.residuals[m, q]
             for i in range(size):
@@ -288,6 +291,7 @@ def summarise(bundle: Bundle, out: FloatArray) -> None:
             i, j, jam = 2 * s, 2 * s + 1, arz.jam[s]
             rho, psi = filters.means[e, i], filters.means[e, j]
             w = psi / rho if rho > VACUUM * jam else v_f
+            # v = w - p(rho), w = psi / rho; var v = (dv/drho, dv/dpsi) P (dv/drho, dv/dpsi)'
             _, by_rho, by_psi = floored_speed(rho, psi, jam, v_f, gamma)
             a, b = by_rho * filters.units[i], by_psi * filters.units[j]
             variance = a * (a * covariance[i, i] + 2.0 * b * covariance[j, i])

@@ -206,6 +206,7 @@ def _assimilate(bundle: Bundle, e: int, seen: IntArray, measured: Measurement, k
     states = np.zeros((padded(n_states), width))
     for i in range(n_states):
         _centre(members[i], n, 1.0, states[i])
+    # S = D D' / (M - 1) + R and C = D X' / (M - 1) (Evensen, 2003), both tapered
     joint, gain = np.dot(distances, distances.T), np.dot(distances, states.T)
     if ensembles.tapers.size > 0:
         _taper(ensembles, seen, joint, gain)
@@ -218,6 +219,7 @@ def _assimilate(bundle: Bundle, e: int, seen: IntArray, measured: Measurement, k
         ensembles.innovations[e, seen[i // 2], i % 2] = innovation
     if not factor(joint):
         return False
+    # x = x + C' S^-1 (z + noise - y) for each member
     solve_many(joint, gain)
     shift = np.dot(gain.T, residuals)
     for i in range(n_states):
@@ -230,6 +232,7 @@ def _assimilate(bundle: Bundle, e: int, seen: IntArray, measured: Measurement, k
 @kernel_part
 def _inflate(members: FloatArray, n: int, factor: float) -> None:
     for i in range(members.shape[0]):
+        # x = m + factor (x - m) (Anderson and Anderson, 1999)
         row, mean = members[i], mean_of(members[i], n)
         for j in range(row.size):
             row[j] = mean + factor * (row[j] - mean)
@@ -268,7 +271,7 @@ def _compare(
             counted = ensembles.count_variance[m] * mean * units[0] / channels.span[m]
             size = np.sqrt(size**2 + counted)
         difference = values[m, kind] / units[kind] - mean
-        for j in range(n):
+        for j in range(n):  # z + noise - y (Burgers et al., 1998)
             residual[j] = difference + size * drawn[j] - distance[j]
         residual[n:] = 0.0
         differences[r], noise[r] = difference, size

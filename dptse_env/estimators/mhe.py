@@ -196,7 +196,7 @@ def _linearise_step(
     for i in range(state.size):
         state[i] /= windows.units[i]
     apply(road, blocks, scratch.by_factor, n_factors, state, product)
-    for i in range(state.size - n_factors):
+    for i in range(state.size - n_factors):  # b = f(x, u) - A x
         windows.offsets[e, t, i] = after[i] / windows.units[i] - product[i]
 
 
@@ -210,7 +210,7 @@ def _linearise_channels(
         if windows.observed[e, t, m]:
             weights, centre = windows.weights[e, t, m], windows.centre[e, t]
             write_channel(arz, channels, windows.units, state, centre, m, weights, constants)
-            for q in range(2):
+            for q in range(2):  # y = z - (h(x) - C x)
                 windows.targets[e, t, m, q] = windows.values[e, t, m, q] - constants[q]
 
 
@@ -221,10 +221,8 @@ def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
     n, width = windows.units.size, windows.solution.shape[2]
     n_stages = windows.solution.shape[1] - 1
     n_channels, size = windows.weights.shape[2], windows.weights.shape[4]
-    factor, free = (
-        make_factor(n_stages, n, n_channels, size, width),
-        np.zeros((n_stages, n), np.int64),
-    )
+    factor = make_factor(n_stages, n, n_channels, size, width)
+    free = np.zeros((n_stages, n), np.int64)
     for k in range(episodes.size):
         e = episodes[k]
         _shift(windows, e)
@@ -419,12 +417,7 @@ class MHE(CovarianceFilter):
 
 def _allocate(model: ARZModel, settings: EstimatorSettings, fallback: BoolArray) -> Windows:
     """Return empty windows of n episodes, which write to `fallback` `(n,)`."""
-    n, s, n_channels, n_episodes = (
-        model.n_states,
-        model.n_segments,
-        model.channels.size,
-        fallback.size,
-    )
+    n, n_channels, n_episodes = model.n_states, model.channels.size, fallback.size
     width, shape = padded(n), (n_episodes, settings.mhe.horizon + 2)
     lower, upper = normalised_bounds(model, settings.mhe.bounds)
     return Windows(
@@ -439,7 +432,7 @@ def _allocate(model: ARZModel, settings: EstimatorSettings, fallback: BoolArray)
         observed=np.zeros((*shape, n_channels), dtype=np.bool_),
         values=np.zeros((*shape, n_channels, 2)),
         noise=np.ones((*shape, n_channels, 2)),
-        centre=np.zeros((*shape, s)),
+        centre=np.zeros((*shape, model.n_segments)),
         weights=np.zeros((*shape, n_channels, 2, 2 * int(model.channels.span.max()))),
         targets=np.zeros((*shape, n_channels, 2)),
         solution=np.zeros((*shape, width)),

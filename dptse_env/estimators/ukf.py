@@ -97,6 +97,7 @@ def _draw(filters: Filters, points: Points, e: int, root: FloatArray) -> bool:
         for i in range(n):
             fill_vector(states[i], np.nan)
         return False
+    # x_0 = m, x_i = m +- sqrt(n + lambda) L_i with P = L L' (Wan and van der Merwe, 2000)
     for i in range(n):
         row, step = states[i], points.spread * filters.units[i]
         fill_vector(row, filters.means[e, i])
@@ -130,6 +131,7 @@ def _gather(
     for i in range(shift.size):
         shift[i] = _distances_from_first(states[i], filters.units[i], points.weight, distances[i])
     products(distances, distances, True, covariance)
+    # P = W sum d_i d_i' + (beta - alpha^2) d d'; see the module's docstring
     for i in range(shift.size):
         for j in range(i + 1):
             covariance[i, j] = (
@@ -191,6 +193,7 @@ def _assimilate(bundle: Bundle, e: int, seen: IntArray, measured: Measurement, k
     outputs, output_shift = np.empty((size, width)), np.empty(size)
     joint, cross = np.empty((size, size)), np.zeros((size, residual + 8))
     noise = _measure(bundle, e, seen, measured, k, outputs, output_shift, cross)
+    # S = W sum y_i y_i' + (beta - alpha^2) y y' + R and C = W sum y_i d_i' + (beta - alpha^2) y d'
     products(outputs, outputs, True, joint)
     products(outputs, distances, False, cross)
     for i in range(size):
@@ -205,7 +208,8 @@ def _assimilate(bundle: Bundle, e: int, seen: IntArray, measured: Measurement, k
             return False
     if not factor(joint):
         return False
-    # With L L' = S, rows of [C, r] become [V, z]: V' V = C' S^-1 C and V' z is the gain times r.
+    # x = x + C' S^-1 r and P = P - C' S^-1 C: with L L' = S, rows of [C, r] become [V, z], where
+    # V' z = C' S^-1 r and V' V = C' S^-1 C.
     forward(joint, cross)
     for i in range(n):
         total = shift[i]
