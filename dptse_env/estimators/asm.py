@@ -7,8 +7,8 @@ traffic, c = c_free > 0 and c = -c_jam < 0:
     z_c(x) = sum_j phi_c z_j / sum_j phi_c
     phi_c = exp(-|x_j - x| / s - |t_j - t - (x_j - x) / c| / tau)
 
-They are the same for densities and speeds, and are mixed by how congested the slower of both finds
-traffic, m = (1 + tanh((V - v) / dV)) / 2 with v = min(v_free, v_jam):
+They are the same for densities and speeds. Their weights depend on the slower of both speeds,
+m = (1 + tanh((V - v) / dV)) / 2 with v = min(v_free, v_jam):
 
     z(x) = m z_jam(x) + (1 - m) z_free(x)
 
@@ -34,14 +34,14 @@ what the mean smooths away, in the variance
     k_1 (a_1 n^(1/2) / l^2 + a_2 (rho_jam - rho_free)^2)      of densities,
     k_2 (b_1 / (1 + n) + b_2 (v_jam - v_free)^2)              of speeds.
 
-With n = rho l vehicles in a segment, their number flickers less than that of a Poisson process, and
+With n = rho l vehicles in a segment, their number varies less than that of a Poisson process, and
 their mean speed the less the more they are. The coefficients are fitted to training traffic of the
 package's roads. The factors k of a segment follow its innovations e, of variance noise + k M, in a
 memory that fades:
 
     k = (K + sum M (e^2 - noise) / (noise + M)^2) / (K + sum M^2 / (noise + M)^2)
 
-held to 1 to 10: they stay at 1 where noise hides what is smoothed away. Where the last release
+clipped to 1 to 10: they stay at 1 where noise hides what is smoothed away. Where the last release
 within reach is of A seconds ago the variances c_1 lanes^2 and c_2 are added, times
 (A / (A + `STALE`))^2: inputs alone say little of a ramp with a queue.
 """
@@ -86,7 +86,7 @@ LARGEST_FACTOR = 10.0
 
 
 class Stencil(NamedTuple):
-    """The J places of values, S segments and then the ends, and the weights that they have."""
+    """Weights of the values at J places, S segments and then the ends of the road."""
 
     target: IntArray  # (Q,) segments that values count for, by place, then by delay
     wave: IntArray  # (Q,) FREE or JAM
@@ -356,10 +356,10 @@ def _evaluate(road: Road, arz: ARZ, stencil: Stencil, state: State, e: int) -> N
         # a_1 n^(1/2) / l^2 + a_2 (rho_jam - rho_free)^2 and b_1 / (1 + n) + b_2 (v_jam - v_free)^2
         length = road.lengths[s]
         vehicles = rho * length
-        flicker = DENSITY_MODEL[0] * math.sqrt(vehicles) / length**2
-        smoothed[s, 0] = flicker + DENSITY_MODEL[1] * gap**2
-        flicker = SPEED_MODEL[0] / (1.0 + vehicles)
-        smoothed[s, 1] = flicker + SPEED_MODEL[1] * (v_jam - v_free) ** 2
+        variation = DENSITY_MODEL[0] * math.sqrt(vehicles) / length**2
+        smoothed[s, 0] = variation + DENSITY_MODEL[1] * gap**2
+        variation = SPEED_MODEL[0] / (1.0 + vehicles)
+        smoothed[s, 1] = variation + SPEED_MODEL[1] * (v_jam - v_free) ** 2
         share = (state.age[e, s] / (state.age[e, s] + STALE)) ** 2
         for i in range(2):
             noise = by_free * math.sqrt(max(free[DENSITY_NOISE + i], 0.0))

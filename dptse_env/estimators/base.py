@@ -50,7 +50,7 @@ class Estimate(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """A second of k episodes as it was released, on its way from the mechanism to the estimator.
+    """Measurement of one second of k episodes, as it was released.
 
     Its C channels are the M of ``model.channels``, then the R boundary segments where these are
     released; estimators read the first M.

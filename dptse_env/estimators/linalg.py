@@ -45,7 +45,7 @@ def multiply(
         by_factor: `(E, 2)` derivatives of the entries' segments by the demand factors.
         right: `(n_x, width)`.
         out: `(n_x, width)`, another matrix.
-        is_lower: Whether to write only the lower half and what is left of the diagonal's register.
+        is_lower: Whether to write only the lower half and the registers on the diagonal.
     """
     n, width = 2 * road.n_segments, right.shape[1]
     for c in range(road.n_segments):

@@ -455,8 +455,8 @@ def moving_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
     """Return the arrival variances `(n_x,)` of a window that moves.
 
     They are those of `arrival_noise`, and for demand factors those of the prior: a window of the
-    default length says less about a factor than its random walk takes away, and an arrival that is
-    too sure of itself keeps a wrong factor for many windows.
+    default length says less about a factor than its random walk takes away, and an overconfident
+    arrival keeps a wrong factor for many windows.
     """
     variance = initial_variance(model, settings)
     n = 2 * model.n_segments

@@ -1,4 +1,4 @@
-"""A mixture of estimators, weighed by how well each foretells what is released."""
+"""A mixture of estimators, weighted by how well each predicts the releases."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,11 +18,10 @@ LEAST_VARIANCE = 1e-12
 
 
 class Mixture(Estimator):
-    """Experts on the same measurements, in a mixture that follows their likelihoods.
+    """Experts on the same measurements, weighted by their likelihoods.
 
-    With the density (or average density, flow or speed) y of a row, its prediction m_i by expert i
-    and V_i the variance of that prediction, noise included, an expert's logarithmic likelihood
-    forgets in a memory of T steps:
+    With a released number y, its prediction m_i by expert i and V_i the variance of that
+    prediction, noise included, an expert's log-likelihood decays with a memory of T steps:
 
         L_i <- (1 - 1 / T) L_i - sum ((y - m_i)^2 / V_i + log V_i) / 2
 
@@ -104,10 +103,10 @@ class Mixture(Estimator):
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
         observed = measured.observed[..., None]
-        errors, variances = self._foretold(self._estimate().at(episodes), measured)
+        errors, variances = self._errors(self._estimate().at(episodes), measured)
         self.innovations[episodes] = np.where(observed, errors / np.sqrt(variances), 0.0)
         for expert, likelihood in zip(self.experts, self._likelihoods, strict=True):
-            errors, variances = self._foretold(expert._estimate().at(episodes), measured)
+            errors, variances = self._errors(expert._estimate().at(episodes), measured)
             costs = np.where(observed, errors**2 / variances + np.log(variances), 0.0)
             likelihood[episodes] *= self._fading
             likelihood[episodes] -= 0.5 * costs.sum(axis=(1, 2))
@@ -119,8 +118,8 @@ class Mixture(Estimator):
             self.innovations[lost] = 0.0
             self._restart(lost)
 
-    def _foretold(self, estimate: Estimate, measured: Measurement) -> tuple[FloatArray, FloatArray]:
-        """Return errors (k, M, 2) of an estimate in what it foretells, and their variances."""
+    def _errors(self, estimate: Estimate, measured: Measurement) -> tuple[FloatArray, FloatArray]:
+        """Return errors (k, M, 2) of predicted releases, and their variances."""
         density, speed, density_std, speed_std = estimate
         second, variance = speed, speed_std**2
         if self.model.centre is not None:

@@ -1,4 +1,4 @@
-"""A recurrent network as an estimator: it learned from simulated traffic what releases mean.
+"""A recurrent network as an estimator, trained on simulated traffic.
 
 Its weights are files (`read_network`): the arrays of a `Network`, and a card that says what the
 network was trained on.

@@ -1,7 +1,7 @@
 """The step of a recurrent network, compiled, for blocks of episodes: its inputs and its weights.
 
-A release is read as a Kalman filter would read it that takes the errors of different cells, and of
-density and speed, as independent. A row m of a measurement averages over its cells two numbers:
+A release is read as by a Kalman filter to which the errors of different cells, and of density and
+speed, are independent. A row m of a measurement averages over its cells two numbers:
 densities rho, and y = rho (v - centre) where flows are released, or y = v where speeds are. The
 prediction of a cell has the variances P_rho, P_v and hence P_y. With the variance V_m of the row's
 innovation e_m, the measured less the predicted average, noise included, a cell's gain and
@@ -10,8 +10,8 @@ correction are, over the rows that cover it,
     K_ms = P_s / (span_m V_m)      d_s = sum_m K_ms e_m
 
 The network gets innovations over their deviations, corrections and gains. So the deviation of the
-noise, which ranges over three orders of magnitude between mechanisms and budgets, is weighed before
-the network sees a release.
+noise, which ranges over three orders of magnitude between mechanisms and budgets, is taken into
+account before the network sees a release.
 
 A gated recurrent unit (Cho et al., 2014) in every cell of a road, with the same weights, reads the
 cell's channels x and the sums u and d of the messages of the cells upstream and downstream: the
@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from dptse_env.estimators.base import Measurement
 from dptse_env.model import ARZModel
+from dptse_env.model.step import clip
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, inline_part, kernel, kernel_part
 
@@ -232,7 +233,7 @@ def _read_channel(
         error = values[j] - mean * share
         innovation[j] = error / np.sqrt(variance)
         for s in range(span):
-            sums[s, 2 + j] += np.log(_held(sigma[j], LEAST_SIGMA, LARGEST_SIGMA))
+            sums[s, 2 + j] += np.log(clip(sigma[j], LEAST_SIGMA, LARGEST_SIGMA))
             sums[s, 4 + j] += innovation[j]
             sums[s, 6 + j] += share / variance * error
             sums[s, 8 + j] += share**2 / variance
@@ -264,7 +265,7 @@ def _write(
     row[4], row[5] = prior[0] / unit, prior[1] / limit
     row[6], row[7] = 0.25 * np.log(prior[2] / unit), 0.25 * np.log(prior[3] / limit)
     for j in range(2):
-        row[8 + j] = 0.5 * _held(sums[4 + j], -LARGEST_INNOVATION, LARGEST_INNOVATION)
+        row[8 + j] = 0.5 * clip(sums[4 + j], -LARGEST_INNOVATION, LARGEST_INNOVATION)
     row[10] = 4.0 * _correction(density_variance * sums[6] / unit)
     row[11] = 4.0 * _correction(slip * density_variance * sums[7] / unit)
     row[12] = 4.0 * _correction(by_speed * speed_variance * sums[7] / limit)
@@ -274,10 +275,9 @@ def _write(
     row[17] = 0.25 * np.log(1.0 + min(age, LONGEST_AGE))
 
 
-@inline_part
+@kernel_part
 def _correction(value: float) -> float:
-    held: float = _held(value, -LARGEST_CORRECTION, LARGEST_CORRECTION)
-    return held
+    return clip(value, -LARGEST_CORRECTION, LARGEST_CORRECTION)
 
 
 @kernel
@@ -364,11 +364,5 @@ def _read_heads(
     """Write density, speed and their deviations."""
     out[0] = DENSITY_RANGE * unit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[0] + bias[0])))
     out[1] = SPEED_RANGE * limit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[1] + bias[1])))
-    out[2] = unit * np.exp(_held(float(raw[2] + bias[2]), LOWEST_SPREAD, HIGHEST_SPREAD))
-    out[3] = limit * np.exp(_held(float(raw[3] + bias[3]), LOWEST_SPREAD, HIGHEST_SPREAD))
-
-
-@inline_part
-def _held(x: float, low: float, high: float) -> float:
-    held: float = min(max(x, low), high)
-    return held
+    out[2] = unit * np.exp(clip(float(raw[2] + bias[2]), LOWEST_SPREAD, HIGHEST_SPREAD))
+    out[3] = limit * np.exp(clip(float(raw[3] + bias[3]), LOWEST_SPREAD, HIGHEST_SPREAD))

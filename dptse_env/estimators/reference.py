@@ -1,4 +1,4 @@
-"""Textbook filters, to hold beside the equations: what compiled ones are compared with.
+"""Textbook filters, with which the compiled ones are compared.
 
 The EKF and the UKF are filterpy's, the moving horizon estimator is solved by qpsolvers, and the
 EnKF is written in numpy: filterpy's draws from numpy's global generator, has a fixed number of

@@ -99,8 +99,8 @@ class RandomWalk(KernelEstimator):
 
     Means are clipped to [0, rho_m] and [0, 1.1 v_f]. A released flow rho (v - v_0) is converted to
     a speed by the density just estimated, which is treated as exact and at least a hundredth of
-    rho_m. A row of several segments corrects each of them by its share of the uncertainty; what it
-    says of their errors together, their covariance, is dropped.
+    rho_m. A row of several segments corrects each of them by its share of the uncertainty; the
+    covariance of their errors is dropped.
 
     Attributes:
         means: Densities [veh/km] and speeds [km/h], `(n, S, 2)`.
