@@ -39,9 +39,9 @@ def random_step(rng, n_factors):
     """Blocks of a transition, some of them zero, derivatives by the factors, and both as F."""
     blocks = rng.normal(size=(*ROAD.neighbours.shape, 4))
     blocks[rng.random(blocks.shape[:2]) < 0.3] = 0.0
-    by_factor, n = rng.normal(size=(n_factors, 2)), 2 * ROAD.jam.size
+    by_factor, n = rng.normal(size=(n_factors, 2)), 2 * ROAD.n_segments
     dense = np.zeros((n + n_factors, n + n_factors))
-    for c in range(ROAD.jam.size):
+    for c in range(ROAD.n_segments):
         for slot in range(ROAD.degree[c]):
             b = ROAD.neighbours[c, slot]
             dense[2 * c : 2 * c + 2, 2 * b : 2 * b + 2] = blocks[c, slot].reshape(2, 2)
