@@ -168,7 +168,7 @@ BAD = {
     r"unit is unknown; it is a field of privacy, privacy=.*; allowed: ": {"unit": "event"},
     "bandwidth must be": {"bandwidth": 2.5},
     "estimator must be one of": {"estimator": "kf"},
-    "estimator must be a class": {"estimator": 3},
+    "estimator must be a subclass": {"estimator": 3},
     "backend must be one of": {"backend": "gpu"},
     "action must be one of": {"action": "flags"},
     "reward must be callable": {"reward": 3},

@@ -123,7 +123,7 @@ def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
     with pytest.raises(ValueError, match=message):
         gym.make("dptse_env:dptse/PrivateHighway-v1", corridor=str(road))
     assert not trace.exists()
-    with pytest.raises(ValueError, match=r"^estimator must be a class, .*, got None$"):
+    with pytest.raises(ValueError, match=r"^estimator must be a subclass of .*, got None$"):
         gym.make("dptse_env:dptse/PrivateHighway-v1", estimator="own:Part")  # as Python may
     assert trace.exists()
 
