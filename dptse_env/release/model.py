@@ -80,7 +80,7 @@ class ReleaseModel(ABC):
         """Begin new episodes.
 
         Args:
-            episodes: Distinct rows of the batch, shape (k,); their traffic is loaded.
+            episodes: Distinct episodes of the batch, shape (k,); their traffic is loaded.
             generators: k noise streams; only the model uses them from now on.
         """
 
@@ -111,7 +111,7 @@ class ReleaseModel(ABC):
         the budget, in the report.
 
         Args:
-            episodes: Distinct rows of the batch, shape (k,).
+            episodes: Distinct episodes of the batch, shape (k,).
             steps: Steps released so far in each of them, shape (k,).
         """
         unknown = np.full(len(steps), math.inf)

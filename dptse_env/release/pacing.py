@@ -61,7 +61,7 @@ class Pacing(ABC):
         It is called once for every second, before its release.
 
         Args:
-            episodes: Distinct rows of the batch, shape (k,).
+            episodes: Distinct episodes of the batch, shape (k,).
             observed: Columns that are observed, shape (k, C).
             density: Predicted densities [veh/km], shape (k, S).
             speed: Predicted speeds [km/h], shape (k, S).
