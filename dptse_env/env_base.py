@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dptse_env.config import resolve
 from dptse_env.estimators import check_settings, require_time_step
-from dptse_env.parts import make_interface, make_model, make_parts, warn_where_void
+from dptse_env.parts import make_interface, make_model, warn_where_void
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records, open_library
@@ -72,11 +72,10 @@ class QueryEnvBase:
     def process(self) -> QueryProcess:
         """The process behind the environment, assembled at the first use."""
         if self._process is None:
-            parts = make_parts(
+            self._process = QueryProcess(
                 self.config, self._n_episodes, self._library,
-                interface=self.interface, model=self._model,
+                interface=self.interface, model=self._model, threads=self._threads,
             )  # fmt: skip
-            self._process = QueryProcess(parts, self._threads)
         return self._process
 
     def privacy(self) -> dict[str, Any]:

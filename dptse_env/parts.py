@@ -9,12 +9,9 @@ from typing import Any
 import numpy as np
 
 from dptse_env.config import TIME_STEP, EnvConfig
-from dptse_env.estimators import Estimator, make_estimator
 from dptse_env.measurement import (
     BOUNDARIES,
     BoundaryModel,
-    DetectorErrors,
-    Fusion,
     make_groups,
 )
 from dptse_env.model import ARZModel
@@ -70,38 +67,6 @@ class QueryInterface:
                 "action_masks() needs action='sequential' or another encoding that picks one "
                 f"option per action, got {name_of_class(self.actions)}"
             )
-
-
-@dataclass(frozen=True)
-class Parts:
-    """The parts of a decision process, for a batch of n episodes.
-
-    Attributes:
-        config: The configuration.
-        interface: Action encoding, observation and reward.
-        traffic: The true traffic.
-        release: The release model, which makes all data that leaves the road.
-        model: The traffic model of the estimator and the boundary.
-        boundary: The model's inputs at the road's ends and ramps.
-        estimator: The estimator.
-        detectors: Errors of the fixed sensors; None where they have none.
-        fusion: Turns releases into measurements of all vehicles; None where they are.
-    """
-
-    config: EnvConfig
-    interface: QueryInterface
-    traffic: Traffic
-    release: ReleaseModel
-    model: ARZModel
-    boundary: BoundaryModel
-    estimator: Estimator
-    detectors: DetectorErrors | None
-    fusion: Fusion | None
-
-    @property
-    def n_episodes(self) -> int:
-        """Size n of the batch."""
-        return self.estimator.n_episodes
 
 
 def make_interface(config: EnvConfig) -> QueryInterface:
@@ -210,48 +175,3 @@ def warn_where_void(config: EnvConfig) -> None:
             UserWarning,
             stacklevel=1,  # one place, so that Python tells it once, however environments are made
         )
-
-
-def make_parts(
-    config: EnvConfig,
-    n_episodes: int = 1,
-    library: RecordLibrary | None = None,
-    *,
-    interface: QueryInterface | None = None,
-    traffic: Traffic | None = None,
-    release: ReleaseModel | None = None,
-    model: ARZModel | None = None,
-    boundary: BoundaryModel | None = None,
-    estimator: Estimator | None = None,
-) -> Parts:
-    """Make the parts that a configuration describes, for a batch of episodes.
-
-    A part that is given is used as it is, and parts that are made of it follow. Reports describe
-    the parts in force.
-
-    Args:
-        config: The configuration.
-        n_episodes: Size n of the batch.
-        library: Source of the records; the user's cache if None.
-        interface: See `Parts`, as for the parts below.
-        traffic: Shared by several processes, records are in memory once.
-        release: Made for n episodes and this traffic.
-        model: The traffic model.
-        boundary: Made for n episodes.
-        estimator: Of n episodes.
-
-    Raises:
-        ValueError: A part of another package is not what is expected.
-    """
-    interface = interface or make_interface(config)
-    traffic = traffic or make_traffic(config, library)
-    release = release or make_release(config, n_episodes, traffic)
-    model, task = model or make_model(config), release.task
-    boundary = boundary or BOUNDARIES[config.privacy.boundary](task, traffic, model)
-    estimator = estimator or make_estimator(
-        config.estimator, config.backend, model, n_episodes, config.settings()
-    )
-    detectors = None if config.detectors.are_exact else DetectorErrors(task, config.detectors)
-    share = config.penetration.published_share
-    fusion = Fusion(task, config.fusion, share) if config.has_separate_sensors else None
-    return Parts(config, interface, traffic, release, model, boundary, estimator, detectors, fusion)

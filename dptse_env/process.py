@@ -12,13 +12,22 @@ from typing import Any
 import numpy as np
 
 from dptse_env.config import EnvConfig
-from dptse_env.estimators import Estimate, Measurement
-from dptse_env.measurement import nominal_state
-from dptse_env.parts import Parts, complete_report
-from dptse_env.release import Request, check_released
+from dptse_env.estimators import Estimate, Estimator, Measurement, make_estimator
+from dptse_env.measurement import BOUNDARIES, DetectorErrors, Fusion, nominal_state
+from dptse_env.model import ARZModel
+from dptse_env.parts import (
+    QueryInterface,
+    complete_report,
+    make_interface,
+    make_model,
+    make_release,
+    make_traffic,
+)
+from dptse_env.release import ReleaseModel, Request, Traffic, check_released
 from dptse_env.spaces.actions import PendingPicks, check_decision
 from dptse_env.spaces.observations import AGE_CAP, PublicState
 from dptse_env.spaces.rewards import EstimationError, ScoredSecond, estimation_error
+from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.fields import shown
 from dptse_env.utils.registry import is_foreign
@@ -73,22 +82,54 @@ class QueryProcess:
         error: Their error, arrays of shape (n,).
     """
 
-    def __init__(self, parts: Parts, threads: int | None = 1) -> None:
-        """Assemble the parts; nothing is recorded or loaded before `reset`.
+    def __init__(
+        self,
+        config: EnvConfig,
+        n_episodes: int = 1,
+        library: RecordLibrary | None = None,
+        *,
+        interface: QueryInterface | None = None,
+        model: ARZModel | None = None,
+        traffic: Traffic | None = None,
+        release: ReleaseModel | None = None,
+        threads: int | None = 1,
+    ) -> None:
+        """Make the parts that a configuration describes; nothing is recorded before `reset`.
+
+        A part that is given is used as it is, and parts that are made of it follow. Reports
+        describe the parts in force.
 
         Args:
-            parts: Made by `dptse_env.parts.make_parts`.
+            config: The configuration.
+            n_episodes: Size n of the batch.
+            library: Source of the records; the user's cache if None.
+            interface: Action encoding, observation and reward.
+            model: The traffic model.
+            traffic: Shared by several processes, records are in memory once.
+            release: Made for n episodes and this traffic.
             threads: Threads that the estimators of a large batch may use; None for one per core.
+
+        Raises:
+            ValueError: A part of another package is not what is expected.
         """
-        self.config, self.interface = parts.config, parts.interface
-        self.traffic, self.release, self.boundary = parts.traffic, parts.release, parts.boundary
-        self.model, self.estimator = parts.model, parts.estimator
-        self.detectors, self.fusion = parts.detectors, parts.fusion
+        self.config, self.n_episodes, n = config, n_episodes, n_episodes
+        self.interface = interface or make_interface(config)
+        self.traffic = traffic or make_traffic(config, library)
+        self.release = release or make_release(config, n, self.traffic)
+        self.model, task = model or make_model(config), self.release.task
+        boundary = BOUNDARIES[config.privacy.boundary]
+        self.boundary = boundary(task, self.traffic, self.model)
+        self.estimator: Estimator = make_estimator(
+            config.estimator, config.backend, self.model, n, config.settings()
+        )
+        exact, share = config.detectors.are_exact, config.penetration.published_share
+        self.detectors = None if exact else DetectorErrors(task, config.detectors)
+        is_fused = config.has_separate_sensors
+        self.fusion = Fusion(task, config.fusion, share) if is_fused else None
         self._threads = EpisodeThreads(threads if self.estimator.is_compiled else 1)
         self._checks_estimates = is_foreign(self.estimator)
         self._checks_releases = is_foreign(self.release)
         self._checks_decisions = is_foreign(self.interface.actions)
-        self.n_episodes = n = parts.n_episodes
         self._seeds = np.array(self.config.traffic_seeds)
         queries = self.interface.queries
         self.pending = PendingPicks(n, queries.n_options)

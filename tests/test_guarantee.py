@@ -13,7 +13,7 @@ import pytest
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate
 from dptse_env.measurement import Detectors
-from dptse_env.parts import make_parts, make_release
+from dptse_env.parts import make_release
 from dptse_env.privacy import ROUNDING, mu_of
 from dptse_env.process import QueryProcess
 from dptse_env.release import CappedSettings, Paced, PacedSettings, Pacing, Request
@@ -171,7 +171,7 @@ class Eavesdropper:
     """
 
     def __init__(self, config, records):
-        self.process = QueryProcess(make_parts(config, library=Worlds(*records)))
+        self.process = QueryProcess(config, library=Worlds(*records))
         self.copies = make_release(config, 4, self.process.traffic)
         self.copies.noise = Silence()
         self.process.traffic.load(np.arange(len(records)))

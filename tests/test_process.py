@@ -8,7 +8,6 @@ from scipy import stats
 
 from dptse_env.config import resolve
 from dptse_env.estimators import ESTIMATORS, REFERENCES
-from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from tests.helpers import COUNTED, PAID, fast_and_slow
 
@@ -20,7 +19,7 @@ ALL = np.arange(3)
 
 def make(n_episodes, preset="short-highway", **keywords):
     keywords = {"traffic_seeds": "0:3", "horizon": 60, "random_start": True, **keywords}
-    return QueryProcess(make_parts(resolve(preset, keywords), n_episodes))
+    return QueryProcess(resolve(preset, keywords), n_episodes)
 
 
 def generators(seeds):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from tests.helpers import (
@@ -57,7 +56,7 @@ def test_batches_are_episodes_whose_queries_stay_within_the_bandwidth(name, acti
 
 def make_process(**keywords):
     defaults = {"privacy": PricedRelease, "traffic_seeds": "0:1", "horizon": 30, "bandwidth": 6}
-    process = QueryProcess(make_parts(resolve("short-highway", {**defaults, **keywords})))
+    process = QueryProcess(resolve("short-highway", {**defaults, **keywords}))
     process.reset(ONE, [np.random.default_rng(4)], {"traffic_seed": 0})
     return process
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.parts import make_parts
 from dptse_env.process import QueryProcess, draw_traffic
 from dptse_env.release.noise import grid_of
 from dptse_env.traffic import RecordLibrary
@@ -19,7 +18,7 @@ EVERYWHERE = {"traffic_seed": 0, "start": 0}
 def begin(seeds, options, **keywords):
     """Return a process with two episodes."""
     every = {"bandwidth": 6, "traffic_seeds": "0:2", "horizon": 80, "random_start": True}
-    process = QueryProcess(make_parts(resolve("short-highway", {**every, **keywords}), 2))
+    process = QueryProcess(resolve("short-highway", {**every, **keywords}), 2)
     process.reset(TWO, [np.random.default_rng(seed) for seed in seeds], options)
     return process
 

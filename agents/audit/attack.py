@@ -14,7 +14,7 @@ from agents.audit.worlds import Worlds, audited
 from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate, Measurement
-from dptse_env.parts import make_parts, make_release, make_traffic
+from dptse_env.parts import make_release, make_traffic
 from dptse_env.process import QueryProcess
 from dptse_env.release import GaussianRelease, ReleaseModel, Request
 from dptse_env.release.noise import Noise
@@ -160,7 +160,7 @@ def make_overheard(
     """Return a process of n episodes of some worlds, and its release model, overheard."""
     config = audited(attacked_form(config), worlds)
     release = Overheard(config, worlds, n, factor)
-    return QueryProcess(make_parts(config, n, traffic=release.traffic, release=release)), release
+    return QueryProcess(config, n, traffic=release.traffic, release=release), release
 
 
 def attack(

@@ -19,7 +19,7 @@ from dptse_env.measurement.boundary import (
     nominal_state,
 )
 from dptse_env.model import ARZModel, load_parameters
-from dptse_env.parts import make_model, make_parts, make_release
+from dptse_env.parts import make_model, make_release
 from dptse_env.process import QueryProcess
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, randomised
 from tests.release.worlds import ONE
@@ -132,7 +132,7 @@ def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(pre
 def test_boundary_segments_are_released_at_every_step_and_drive_the_next():
     privacy = {"preset": "capped", "boundary_inputs": "private"}
     keywords = {"traffic_seeds": "0:2", "horizon": 100, "random_start": True, "privacy": privacy}
-    process = QueryProcess(make_parts(resolve("short-highway", keywords), 1))
+    process = QueryProcess(resolve("short-highway", keywords))
     process.reset(ONE, [np.random.default_rng(3)], {"traffic_seed": 1, "start": 100})
     released, inputs = [], []
     release, predict = process.release.release, process.estimator.predict

@@ -8,7 +8,7 @@ import pytest
 
 from dptse_env.config import resolve
 from dptse_env.measurement import Detectors, make_groups
-from dptse_env.parts import make_parts, make_release, privacy_report
+from dptse_env.parts import make_release, privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.process import QueryProcess
 from dptse_env.release import Group
@@ -37,7 +37,7 @@ def begun(preset="paced", seed=3, *, privacy=None, **keywords):
         "privacy": {"preset": preset, **(privacy or {})},
         **keywords,
     }
-    process = QueryProcess(make_parts(resolve("short-highway", given)))
+    process = QueryProcess(resolve("short-highway", given))
     process.reset(ONE, [np.random.default_rng(seed)], {"traffic_seed": 1, "start": 150})
     return process
 
@@ -89,10 +89,10 @@ def test_groups_are_queries_and_sensors_with_their_parts_of_the_budget():
     assert shares(some, Detectors(), bare) == {"queries": 1.0}
     assert set(shares(some, Detectors(), bare, private=True)) == {"queries", "sensors"}
     for all_connected in ({}, {"penetration": 1.0}, {"penetration": {"seed": 4}}):
-        parts = make_parts(resolve("short-highway", all_connected))
-        assert parts.release.task.groups == (Group("queries"),)
-        assert (parts.fusion, parts.detectors) == (None, None)
-        assert "groups" not in parts.release.report().to_dict()
+        process = QueryProcess(resolve("short-highway", all_connected))
+        assert process.release.task.groups == (Group("queries"),)
+        assert (process.fusion, process.detectors) == (None, None)
+        assert "groups" not in process.release.report().to_dict()
 
 
 def test_a_model_that_knows_of_no_groups_is_refused_before_anything_is_recorded():
