@@ -18,8 +18,7 @@ from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.evaluation import WARM_UP
 from dptse_env.importers.fields import FieldSource, by_second
 from dptse_env.parts import make_model, make_release
-from dptse_env.traffic import Corridor, Demand
-from dptse_env.traffic.roads import DENSITY_SCALE
+from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Scales
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.fields import require
 from dptse_env.utils.units import HOUR
@@ -67,22 +66,15 @@ def field_corridor(field: Field, lanes: int, speed_limit: float) -> Corridor:
     """Return a straight road for a field; scales grow with lanes and limit as on other roads."""
     n = field.density.shape[1] - 2
     dwell = HOUR * field.segment_length / float(field.speed[:, 1:-1].mean())
+    demand = Demand(mainline=((0.0, float((field.density * field.speed)[:, 0].mean())),))
+    geometry = Geometry(
+        n, lanes=lanes, segment_length=field.segment_length, speed_limit=speed_limit
+    )
     return Corridor(
-        name="measured-field",
-        n_mainline=n,
-        on_ramps=(),
-        off_ramps=(),
-        exit_shares=(),
-        demand=Demand(mainline=((0.0, float((field.density * field.speed)[:, 0].mean())),)),
-        incident=None,
-        fixed_sensors=(),
-        duration=len(field.density),
-        lanes=lanes,
-        segment_length=field.segment_length,
-        speed_limit=speed_limit,
-        density_scale=DENSITY_SCALE * lanes,
-        speed_scale=speed_limit,
-        average_dwell=dwell,
+        "measured-field",
+        geometry,
+        Conditions(demand, duration=len(field.density)),
+        Scales.of(geometry, dwell),
     )
 
 
@@ -133,10 +125,12 @@ class Replay:
         starts = np.repeat(starts, self.n_repeats)
         times = starts[:, None] + np.arange(self.window + 1)
         truth = np.stack([field.density, field.speed], axis=-1)[times]
-        k, n, everyone = len(starts), corridor.n_mainline, np.arange(len(starts))
+        k, n, everyone = len(starts), corridor.geometry.n_mainline, np.arange(len(starts))
         model = make_model(config)
         made = make_estimator(config.estimator, config.backend, model, k, config.settings())
-        lanes, limits = (np.array(of) for of in (corridor.segment_lanes, corridor.speed_limits))
+        lanes, limits = (
+            np.array(of) for of in (corridor.geometry.segment_lanes, corridor.geometry.speed_limits)
+        )
         start = np.tile(25.0 * lanes, (k, 1)), np.tile(0.5 * limits, (k, 1))
         made.reset(everyone, model.states(*start), rng.spawn(k))
         squares, ratios = [], []
@@ -154,7 +148,7 @@ class Replay:
                 squares.append(error**2)
                 ratios.append((error / np.stack([said.density_std, said.speed_std], -1)) ** 2)
         squared, chi2 = np.array(squares), np.mean(ratios, axis=(0, 1, 2))
-        scales = np.array([corridor.density_scale, corridor.speed_scale])
+        scales = np.array([corridor.scales.density_scale, corridor.scales.speed_scale])
         error = np.sqrt((squared / scales**2).mean(axis=(-2, -1))).mean()
         density, speed = np.sqrt(squared.mean(axis=(0, 1, 2)))
         return FieldScore(1000.0 * float(error), *map(float, (density, speed, *chi2)))

@@ -67,7 +67,7 @@ def simulating() -> Work:
         with running(corridor, scenario) as libsumo:
             for _ in seconds_of(libsumo, corridor, scenario):
                 pass
-        return corridor.duration
+        return corridor.conditions.duration
 
     return turn
 
@@ -78,7 +78,7 @@ def recording(folder: Path) -> Work:
 
     def turn() -> int:
         RecordLibrary(folder / str(next(libraries))).get(corridor, 0)
-        return corridor.duration
+        return corridor.conditions.duration
 
     return turn
 

@@ -16,7 +16,7 @@ from agents.environments import quietly
 from agents.figures import LABELS
 from benchmarks.estimators import Replay, tapped_calls
 from benchmarks.turns import Line, compare, take_turns
-from dptse_env.traffic import Corridor, Demand, Incident
+from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Incident, Scales
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 DURATION = 1200  # [s], in which a vehicle passes 200 segments and a jam ends
@@ -31,22 +31,22 @@ def long_road(n_mainline: int) -> Corridor:
     dense at both ends. The jam begins in two thirds of the way.
     """
     on_ramps, off_ramps = range(5, n_mainline, EVERY), range(12, n_mainline, EVERY)
+    geometry = Geometry(
+        n_mainline, tuple(on_ramps), tuple(off_ramps), exit_shares=(0.08,) * len(off_ramps)
+    )
+    demand = Demand(
+        mainline=((0.0, 3600.0), (300.0, 5200.0), (800.0, 3600.0)),
+        on_ramps=(350.0,) * len(on_ramps),
+    )
+    incident = Incident(
+        segment=2 * n_mainline // 3, phases=((500.0, 800.0, 10.0), (800.0, 900.0, 50.0))
+    )
     return Corridor(
-        name=f"long-road-{n_mainline}",
-        n_mainline=n_mainline,
-        on_ramps=tuple(on_ramps),
-        off_ramps=tuple(off_ramps),
-        exit_shares=(0.08,) * len(off_ramps),
-        demand=Demand(
-            mainline=((0.0, 3600.0), (300.0, 5200.0), (800.0, 3600.0)),
-            on_ramps=(350.0,) * len(on_ramps),
-        ),
-        incident=Incident(
-            segment=2 * n_mainline // 3, phases=((500.0, 800.0, 10.0), (800.0, 900.0, 50.0))
-        ),
+        f"long-road-{n_mainline}",
+        geometry,
+        Conditions(demand, DURATION, incident),
+        Scales.of(geometry, average_dwell=5.0),
         fixed_sensors=(n_mainline - 1, n_mainline, n_mainline + 1),
-        duration=DURATION,
-        average_dwell=5.0,
     )
 
 
@@ -57,7 +57,7 @@ def measure(*, quick: bool = False) -> list[Line]:
     for n in lengths:
         road = long_road(n)
         if quick:
-            road = replace(road, duration=60, incident=None)
+            road = road.replaced(duration=60, incident=None)
         with quietly():
             env = gym.make_vec(
                 "dptse_env:dptse/PaperHighway-v0", num_envs=1, threads=1, corridor=road,

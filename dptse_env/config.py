@@ -191,7 +191,7 @@ class EnvConfig:
     def queries(self) -> QueryOptions:
         """The queries among which a policy chooses."""
         return QueryOptions.make(
-            self.corridor.n_mainline,
+            self.corridor.geometry.n_mainline,
             self.bandwidth,
             self.query_spans,
             self.bandwidth_unit,
@@ -201,12 +201,12 @@ class EnvConfig:
     @property
     def horizon_steps(self) -> int:
         """Length of an episode [s]."""
-        return self.corridor.duration if self.horizon is None else self.horizon
+        return self.corridor.conditions.duration if self.horizon is None else self.horizon
 
     @property
     def last_start(self) -> int:
         """Latest second of the record at which an episode may start."""
-        return self.corridor.duration - self.horizon_steps
+        return self.corridor.conditions.duration - self.horizon_steps
 
     @property
     def release_model(self) -> Any:
@@ -260,11 +260,13 @@ def _corridor(path: str, value: Any, base: Corridor) -> Corridor:
         return made
     names = {"demand": ("preset", "random"), "incident": ("preset", "random", "none")}
     named = {key: value[key] for key in names if isinstance(value.get(key), str)}
-    corridor = base.replaced({key: each for key, each in value.items() if key not in named})
+    fields = {key: each for key, each in value.items() if key not in named}
+    corridor = Corridor.from_fields(fields, base)
     for key, name in named.items():
         require_name(f"{path}.{key}", name, names[key])
         source = randomised(corridor) if name == "random" else corridor
-        corridor = corridor.replaced({key: None if name == "none" else getattr(source, key)})
+        given = None if name == "none" else getattr(source.conditions, key)
+        corridor = corridor.replaced(**{key: given})
     return corridor
 
 
@@ -285,7 +287,7 @@ def _privacy(path: str, value: Any, base: PrivacySettings, corridor: Corridor) -
         value = from_mapping(type(base), {**given, "preset": preset}, path, base)
     model = RELEASE_MODELS.find(value.preset)
     blind = "one that needs no vehicles, as 'paper', on a road of measured fields"
-    is_served = has_vehicles(corridor.recordings) or not model.needs_vehicles
+    is_served = has_vehicles(corridor.source.recordings) or not model.needs_vehicles
     require(is_served, f"{path}.preset", blind, RELEASE_MODELS.name_of(value.preset))
     own = f"'seeded' {_with_model(value)}, whose noise is its own"
     require(value.noise == "seeded" or model.takes_noise, f"{path}.noise", own, value.noise)
@@ -302,7 +304,7 @@ def _penetration(
     """Return the connected vehicles; a number, or a pair of numbers, is their share."""
     fields = value if isinstance(value, Mapping | Penetration) else {"share": value}
     found: Penetration = _typed(path, fields, base)
-    whole = found.is_complete or has_vehicles(corridor.recordings)
+    whole = found.is_complete or has_vehicles(corridor.source.recordings)
     require(whole, f"{path}.share", "1 on a road of measured fields", found.share)
     alike = f"1 {_with_model(privacy)}, which knows of no groups of columns"
     is_served = found.is_complete or RELEASE_MODELS.find(privacy.preset).knows_groups
@@ -319,7 +321,7 @@ def _detectors(
     each = f"one number, or one for each of the {n} fixed sensors"
     require(not isinstance(factor, tuple) or len(factor) == n, f"{path}.factor", each, factor)
     exact = "left out on a road without fixed sensors, and on one of measured fields"
-    has_any = n > 0 and has_vehicles(corridor.recordings)
+    has_any = n > 0 and has_vehicles(corridor.source.recordings)
     require(has_any or found == Detectors(), path, exact, found)
     alike = f"left out {_with_model(privacy)}, which knows of no groups of columns"
     is_served = found == Detectors() or RELEASE_MODELS.find(privacy.preset).knows_groups
@@ -371,14 +373,14 @@ def _spans(
 ) -> tuple[int, ...]:
     """Return numbers of segments, which the road must have and the release model must sum."""
     spans: tuple[int, ...] = _typed(path, value, base)
-    n = corridor.n_mainline
+    n = corridor.geometry.n_mainline
     check_spans(n, spans)
     if max(spans) > 1:
         model = RELEASE_MODELS.find(privacy.preset)
         plain = f"(1,) {_with_model(privacy)}, which releases no sums"
         require(model.releases_sums, path, plain, spans)
         alike = "(1,) where mainline segments differ in length"
-        require(len(set(corridor.segment_lengths[:n])) == 1, path, alike, spans)
+        require(len(set(corridor.geometry.segment_lengths[:n])) == 1, path, alike, spans)
         centre = model.centre(corridor, privacy)
         require(centre is not None, path, "(1,) where mean speeds are released", spans)
     return spans
@@ -389,7 +391,7 @@ def _bandwidth(
 ) -> int:
     """Return the bandwidth, which must pay for a query and not for more than the road has."""
     found: int = _typed(path, value, base)
-    n, least = corridor.n_mainline, spans[0] if unit == "segments" else 1
+    n, least = corridor.geometry.n_mainline, spans[0] if unit == "segments" else 1
     reason = f", to pay for a query of {least} segments" if least > 1 else ""
     require(least <= found <= n, path, f"in {least}..{n}{reason}", found)
     return found
@@ -397,7 +399,7 @@ def _bandwidth(
 
 def _limited_bandwidth(base: int, corridor: Corridor, *_: Any) -> int:
     """Return the preset's bandwidth, or, with a warning, all segments of a shorter road."""
-    n = corridor.n_mainline
+    n = corridor.geometry.n_mainline
     if n < base:
         warnings.warn(
             f"bandwidth is {n}, the number of mainline segments, since nobody gave it and "
@@ -422,9 +424,9 @@ def _horizon(
 ) -> int | None:
     """Return the length of an episode, which the record must have, and more for a random start."""
     found: int | None = _typed(path, value, base)
-    most = corridor.duration - random_start
+    most = corridor.conditions.duration - random_start
     allowed = f"in 1..{most}, shorter than the record for a random start"
-    fits = (corridor.duration if found is None else found) <= most
+    fits = (corridor.conditions.duration if found is None else found) <= most
     require(fits, path, allowed if random_start else f"in 1..{most}", found)
     return found
 
@@ -437,16 +439,18 @@ def _seeds(path: str, value: Any, base: Any, corridor: Corridor) -> tuple[int, .
     n = len(seeds)
     require(1 <= n <= MOST_SEEDS, path, f"1 to {MOST_SEEDS} seeds", f"{n} of them")
     require(len(set(seeds)) == n, path, "distinct", seeds)
-    if corridor.recordings is not None:
-        require_seeds(corridor.recordings, seeds, path)
+    if corridor.source.recordings is not None:
+        require_seeds(corridor.source.recordings, seeds, path)
     return seeds
 
 
 def _recorded_seeds(base: tuple[int, ...], corridor: Corridor) -> tuple[int, ...]:
     """Return the preset's traffic seeds, or all of training that were recorded on the road."""
-    if corridor.recordings is None:
+    if corridor.source.recordings is None:
         return base
-    return tuple(seed for seed in recorded_seeds(corridor.recordings) if seed in TRAINING_SEEDS)
+    return tuple(
+        seed for seed in recorded_seeds(corridor.source.recordings) if seed in TRAINING_SEEDS
+    )
 
 
 def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:
@@ -600,11 +604,14 @@ def _unknown(key: str, origin: str) -> UnknownKeywordError:
     """Return the error for a keyword that there is not, with those that have such a field."""
     # A plugin that nobody has used yet is a name.
     models = [each for each in RELEASE_MODELS.values() if not isinstance(each, str)]
-    nested = {"privacy": [each.settings_type for each in models], "corridor": [Corridor]}
+    fields = {
+        "privacy": {name for each in models for name in field_hints(each.settings_type)},
+        "corridor": Corridor.hints(),
+    }
     hints = [
         f"it is a field of {name}, {name}={{{key!r}: ...}}; "
-        for name, types in nested.items()
-        if any(key in field_hints(each) for each in types)
+        for name, known in fields.items()
+        if key in known
     ]
     return UnknownKeywordError(
         f"{origin}{cut(key)} is unknown; {''.join(hints)}allowed: "
@@ -617,7 +624,7 @@ def _inherited(
 ) -> tuple[str, ...]:
     """Return the keywords whose values are of another road or parameter set, or assumed."""
     corridor, parameters = config.corridor, config.parameters
-    is_other_road = not any(corridor.has_geometry_of(each.corridor) for each in PRESETS.values())
+    is_other_road = corridor.geometry not in [each.corridor.geometry for each in PRESETS.values()]
     found = []
     if is_other_road:
         found = [f"corridor.{name}" for name in assumed]

@@ -58,7 +58,7 @@ class History:
     def empty(cls, process: QueryProcess, episode: int = 0) -> History:
         """Return the history of an episode of ``process`` that is to begin."""
         config, corridor = process.config, process.config.corridor
-        lengths = corridor.segment_lengths[: corridor.n_mainline]
+        lengths = corridor.geometry.segment_lengths[: corridor.geometry.n_mainline]
         known = config.estimator
         estimator = known if isinstance(known, str) else getattr(known, "__name__", "your own")
         is_sums = config.bandwidth_unit == "sums"
@@ -66,7 +66,7 @@ class History:
         title = (
             f"{corridor.name}, estimator {estimator}, queries {config.bandwidth} {unit} a second"
         )
-        scale = corridor.density_scale
+        scale = corridor.scales.density_scale
         return cls(episode, config.horizon_steps, lengths, scale, title=title)
 
     @property

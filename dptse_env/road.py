@@ -1,6 +1,6 @@
-"""The geometry of a road as arrays, made of a corridor once, for all that computes on it.
+"""The geometry of a road as arrays, made of a `Geometry` once, for all that computes on it.
 
-Its cells are the S segments, in the order of `dptse_env.traffic.corridor`, then the R boundary
+Its cells are the S segments, in the order of `dptse_env.traffic.geometry`, then the R boundary
 segments around them: upstream and downstream of the mainline, before each on-ramp, after each
 off-ramp.
 
@@ -67,12 +67,12 @@ class Road(NamedTuple):
         return self
 
 
-def make_road(corridor: Any) -> Road:
-    """Return the arrays of a corridor."""
-    n, on, off = corridor.n_mainline, corridor.on_ramp_segments, corridor.off_ramp_segments
-    S, n_on, n_off = corridor.n_segments, len(on), len(off)
-    lengths = np.array(corridor.with_boundaries(corridor.segment_lengths), dtype=np.float64)
-    beside = np.array(corridor.boundary_neighbours, dtype=np.int64)
+def make_road(geometry: Any) -> Road:
+    """Return the arrays of a geometry."""
+    n, on, off = geometry.n_mainline, geometry.on_ramp_segments, geometry.off_ramp_segments
+    S, n_on, n_off = geometry.n_segments, len(on), len(off)
+    lengths = np.array(geometry.with_boundaries(geometry.segment_lengths), dtype=np.float64)
+    beside = np.array(geometry.boundary_neighbours, dtype=np.int64)
 
     kind, share = np.full(S, EXIT, dtype=np.int64), np.zeros(S)
     parties = np.full((S, 3), -1, dtype=np.int64)
@@ -80,12 +80,12 @@ def make_road(corridor: Any) -> Road:
     for segments in (tuple(range(n)), *on, *off):
         for up, down in itertools.pairwise(segments):
             kind[up], parties[up, 1] = LINK, down
-    for face, segments in zip(corridor.on_ramps, on, strict=True):
+    for face, segments in zip(geometry.on_ramps, on, strict=True):
         main, joining = face - 1, segments[-1]
         kind[[main, joining]] = MERGE
         parties[main, 1:] = face, joining
         parties[joining, 1:] = face, main
-    ramps = zip(corridor.off_ramps, off, corridor.exit_shares, strict=True)
+    ramps = zip(geometry.off_ramps, off, geometry.exit_shares, strict=True)
     for face, segments, exit_share in ramps:
         kind[face - 1], share[face - 1] = DIVERGE, exit_share
         parties[face - 1, 1:] = face, segments[0]
@@ -101,7 +101,7 @@ def make_road(corridor: Any) -> Road:
     position = np.empty(S)
     position[:n] = 0.5 * (faces[:-1] + faces[1:])
     for ramp, (face, segments) in enumerate(
-        zip((*corridor.on_ramps, *corridor.off_ramps), (*on, *off), strict=True)
+        zip((*geometry.on_ramps, *geometry.off_ramps), (*on, *off), strict=True)
     ):
         stretch[list(segments)], position[list(segments)] = 1 + ramp, faces[face]
 
@@ -116,8 +116,8 @@ def make_road(corridor: Any) -> Road:
         n_mainline=n,
         n_segments=S,
         lengths=lengths,
-        lanes=np.array(corridor.with_boundaries(corridor.segment_lanes), dtype=np.float64),
-        limits=np.array(corridor.with_boundaries(corridor.speed_limits), dtype=np.float64),
+        lanes=np.array(geometry.with_boundaries(geometry.segment_lanes), dtype=np.float64),
+        limits=np.array(geometry.with_boundaries(geometry.speed_limits), dtype=np.float64),
         beside=beside,
         stretch=stretch,
         position=position,

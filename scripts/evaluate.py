@@ -125,7 +125,7 @@ def make_cells(args: Args) -> list[Cell]:
     for estimator in args.estimators or (str(config.estimator),):
         own = {**given, "estimator": estimator} if args.estimators else given
         for name, policy in policies.items():
-            more = {"bandwidth": config.corridor.n_mainline} if policy == ALL else {}
+            more = {"bandwidth": config.corridor.geometry.n_mainline} if policy == ALL else {}
             cells.append(
                 Cell(
                     env,

@@ -133,7 +133,9 @@ class Field:
             self.source, self.road, self.output, splits(self.shares), self.duration
         )
         print_seeds(seeds)
-        print(f"road: {self.output / ROAD}, segments of {corridor.segment_lengths[0]:g} km")
+        print(
+            f"road: {self.output / ROAD}, segments of {corridor.geometry.segment_lengths[0]:g} km"
+        )
         print_next(
             self.output / ROAD,
             seeds,
@@ -277,12 +279,17 @@ def print_next(
     """
     missing = [name for name, own in seeds.items() if not own]
     if missing:
+        most = corridor.conditions.duration
         print(
             f"note: there is no window for {' and '.join(missing)}, which fitting and evaluating "
-            f"need: a duration below {corridor.duration} s, more files or other shares make some"
+            f"need: a duration below {most} s, more files or other shares make some"
         )
         return
-    given = {"bandwidth": min(2, corridor.n_mainline), **keywords, "corridor": road.as_posix()}
+    given = {
+        "bandwidth": min(2, corridor.geometry.n_mainline),
+        **keywords,
+        "corridor": road.as_posix(),
+    }
     first, last = seeds["test"][0], seeds["test"][-1]
     fit = "fit", road.as_posix(), *(("--env", fit_for) if fit_for else ())
     evaluate = "evaluate", "--env", f"{env} {json.dumps(given)}", "--seeds", f"{first}:{last + 1}"
@@ -292,22 +299,27 @@ def print_next(
 
 def describe(road: ImportedRoad) -> str:
     """Describe a road of a network in a few lines."""
-    corridor, segments, network = road.corridor, road.segments, road.corridor.network
+    corridor, segments, network = road.corridor, road.segments, road.corridor.source.network
     assert network is not None
-    on, off = segments.names[: corridor.n_on_ramps], segments.names[corridor.n_on_ramps :]
+    on, off = (
+        segments.names[: corridor.geometry.n_on_ramps],
+        segments.names[corridor.geometry.n_on_ramps :],
+    )
     lengths = segments.lengths
-    demand = corridor.published_demand
+    demand = corridor.conditions.published_demand
     lines = [
         f"{corridor.name}: from {Path(network.net).name}, seconds {network.begin} to "
-        f"{network.begin + corridor.duration}",
-        f"{corridor.n_mainline} segments of {min(lengths):.0f} to {max(lengths):.0f} m, "
+        f"{network.begin + corridor.conditions.duration}",
+        f"{corridor.geometry.n_mainline} segments of {min(lengths):.0f} to {max(lengths):.0f} m, "
         f"{min(segments.lanes)} to {max(segments.lanes)} lanes, "
         f"{min(segments.limits):.0f} to {max(segments.limits):.0f} km/h",
         f"mainline: {_range(demand.mainline)}",
     ]
-    for face, name, rates in zip(corridor.on_ramps, on, demand.ramp_profiles, strict=True):
+    for face, name, rates in zip(corridor.geometry.on_ramps, on, demand.ramp_profiles, strict=True):
         lines.append(f"on-ramp at face {face}: {name}, {_range(rates)}")
-    for face, name, share in zip(corridor.off_ramps, off, corridor.exit_shares, strict=True):
+    for face, name, share in zip(
+        corridor.geometry.off_ramps, off, corridor.geometry.exit_shares, strict=True
+    ):
         lines.append(f"off-ramp at face {face}: {name}, {100 * share:.1f} % leave")
     lines += [f"note: {remark}" for remark in road.remarks]
     return "\n".join(lines)

@@ -74,7 +74,7 @@ def make_plans(args: Args) -> dict[Path, TrainingPlan]:
     seeds, more = parse_seeds(args.seeds), parse_json(args.keywords, "keywords")
     require(isinstance(more, dict), "keywords", "a JSON object", args.keywords)
     envs = [(env, {**more, **own}) for env, own in map(parse_env, args.env)]
-    n_segments = make_config(*envs[0]).corridor.n_mainline if envs else 0
+    n_segments = make_config(*envs[0]).corridor.geometry.n_mainline if envs else 0
     algorithm, minutes = parse_algorithm(args.algorithm, n_segments), args.minutes
     if minutes is None and args.steps is None and not isinstance(algorithm, PlackettLuceSettings):
         minutes = MINUTES

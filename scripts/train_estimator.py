@@ -115,7 +115,7 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
         rounds=tuple(parse_round(each) for each in args.rounds),
         width=FilterPlan.width if initial is None else read_network(initial).network.width,
         windows=min(FilterPlan.windows, len(traffic)),
-        seconds=min(FilterPlan.seconds, *(road.duration for road in roads)),
+        seconds=min(FilterPlan.seconds, *(road.conditions.duration for road in roads)),
         initial=initial,
         **(CONTINUED if initial is not None else {}),
     )

@@ -56,7 +56,7 @@ from dptse_env.release import RELEASE_MODELS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.spaces.observations import BLOCKS
 from dptse_env.spaces.rewards import REWARDS
-from dptse_env.traffic import CORRIDORS, SHORT_HIGHWAY, write_corridor
+from dptse_env.traffic import CORRIDORS, SHORT_HIGHWAY, Corridor, write_corridor
 from dptse_env.utils.fields import Interval, field_hints
 from tests.hostile import ODD, changed, changed_tensors
 from tests.importers.data import PLAIN, SPLITS, STRAIGHT, plain, stream
@@ -129,8 +129,6 @@ def some_fields(cls, rng, wrong, n=3):
         for field in dataclasses.fields(cls)
         if field.name in hints and field.default is missing and field.default_factory is missing
     ]
-    if cls is type(SHORT_HIGHWAY):
-        needed = []  # the others are those of the road that is changed
     chosen = {*needed, *rng.choice([*hints], min(len(hints), int(rng.integers(n + 1))), False)}
     return {str(name): some(hints[name], rng, wrong) for name in hints if name in chosen}
 
@@ -162,7 +160,7 @@ ONLY_NAMES = ("estimator", "action", "reward", "backend", "bandwidth_unit")
 
 def keyword(name, rng, given):
     """A value of a keyword, given those that were drawn before."""
-    hints = {**field_hints(EnvConfig), **field_hints(type(SHORT_HIGHWAY))}
+    hints = {**field_hints(EnvConfig), **Corridor.hints()}
     if rng.random() < 0.05:
         return ODD[rng.integers(len(ODD))]
     if name in NAMES and (rng.random() < 0.5 or name in ONLY_NAMES):
@@ -204,9 +202,10 @@ def play(env, keywords, n_steps=3):
     made = gym.make(f"dptse_env:{env}", **keywords)
     bare, corridor = made.unwrapped, made.unwrapped.config.corridor
     assert bare.process.n_episodes == 1
-    size = corridor.duration * corridor.n_segments
-    if size > SHORT_HIGHWAY.duration * SHORT_HIGHWAY.n_segments * 4 and corridor not in (
-        CORRIDORS.values()
+    size = corridor.conditions.duration * corridor.geometry.n_segments
+    if (
+        size > SHORT_HIGHWAY.conditions.duration * SHORT_HIGHWAY.geometry.n_segments * 4
+        and corridor not in (CORRIDORS.values())
     ):
         return  # SUMO would take most of the time
     observation, _ = made.reset(seed=0)
@@ -226,7 +225,7 @@ def roads(rng, folder):
     table = {"bandwidth": 2, "horizon": 5, "traffic_seeds": [0], "estimator": "ekf",
              "observation": ["default"], "privacy": {"preset": "paced"},
              "estimator_settings": {"process_noise": [0.01, 0.01]}}  # fmt: skip
-    write_corridor(path, dataclasses.replace(SHORT_HIGHWAY, duration=60, incident=None), table)
+    write_corridor(path, SHORT_HIGHWAY.replaced(duration=60, incident=None), table)
     path.write_bytes(changed(path.read_bytes(), rng))
     return path.read_bytes(), lambda: play("dptse/ShortHighway-v0", {"corridor": str(path)}), path
 

@@ -20,7 +20,7 @@ from dptse_env.model import Channels
 from dptse_env.parts import make_interface
 from dptse_env.release import ReleaseModel
 from dptse_env.road import Road, make_road
-from dptse_env.traffic import SHORT_HIGHWAY, Corridor, Demand, Record
+from dptse_env.traffic import SHORT_HIGHWAY, Conditions, Corridor, Demand, Geometry, Record, Scales
 from dptse_env.utils.kernels import kernel
 
 SHORT = "dptse_env:dptse/ShortHighway-v0"
@@ -206,26 +206,27 @@ def lock_step(
 
 # --- roads and records ----------------------------------------------------------------------------
 
-SHORT_COLUMNS = SHORT_HIGHWAY.n_segments + SHORT_HIGHWAY.n_boundaries
+SHORT_COLUMNS = SHORT_HIGHWAY.geometry.n_segments + SHORT_HIGHWAY.geometry.n_boundaries
 AWAY = -1
 """Place of a vehicle that is not on the road."""
 
 UNEVEN = Corridor(
     name="uneven",
-    n_mainline=8,
-    on_ramps=(2, 3),
-    off_ramps=(4, 6),
-    exit_shares=(0.2, 0.1),
-    demand=Demand(mainline=((0.0, 2000.0),), on_ramps=(300.0, 200.0)),
-    incident=None,
+    geometry=Geometry(
+        n_mainline=8,
+        on_ramps=(2, 3),
+        off_ramps=(4, 6),
+        exit_shares=(0.2, 0.1),
+        lanes=(3, 3, 4, 4, 4, 3, 2, 2),
+        ramp_lanes=(1, 2, 2, 1),
+        segment_length=(0.1, 0.12, 0.2, 0.1, 0.35, 0.09, 0.1, 0.15),
+        speed_limit=(102.0, 102.0, 102.0, 120.0, 120.0, 80.0, 80.0, 80.0),
+        ramp_segments=(1, 3, 2, 1),
+        ramp_length=(0.1, 0.08, 0.2, 0.15),
+    ),
+    conditions=Conditions(Demand(mainline=((0.0, 2000.0),), on_ramps=(300.0, 200.0)), duration=200),
+    scales=Scales(density_scale=333.0, speed_scale=102.0, average_dwell=8.0),
     fixed_sensors=(7,),
-    duration=200,
-    lanes=(3, 3, 4, 4, 4, 3, 2, 2),
-    ramp_lanes=(1, 2, 2, 1),
-    segment_length=(0.1, 0.12, 0.2, 0.1, 0.35, 0.09, 0.1, 0.15),
-    speed_limit=(102.0, 102.0, 102.0, 120.0, 120.0, 80.0, 80.0, 80.0),
-    ramp_segments=(1, 3, 2, 1),
-    ramp_length=(0.1, 0.08, 0.2, 0.15),
 )
 """A road with segments and ramps of many kinds."""
 
@@ -233,7 +234,7 @@ UNEVEN = Corridor(
 def short_road(duration: int) -> Corridor:
     """Return the short highway for records of `duration` seconds, without its incident."""
     demand = Demand(((0.0, 1000.0),), (100.0,))
-    return dataclasses.replace(SHORT_HIGHWAY, duration=duration, demand=demand, incident=None)
+    return SHORT_HIGHWAY.replaced(duration=duration, demand=demand, incident=None)
 
 
 def record(places: Any, speeds: Any, n_columns: int = SHORT_COLUMNS) -> Record:
@@ -248,7 +249,7 @@ def record(places: Any, speeds: Any, n_columns: int = SHORT_COLUMNS) -> Record:
 
 @dataclasses.dataclass(frozen=True)
 class Stretch:
-    """The fields of a corridor that a road is made of, within wider limits than a corridor's."""
+    """The fields of a geometry that a road is made of, within wider limits than a corridor's."""
 
     n_mainline: int = 15
     on_ramps: tuple[int, ...] = ()
@@ -259,6 +260,10 @@ class Stretch:
     lanes: int = 3
     ramp_lanes: int = 1
     more_outside: int = 0
+
+    @property
+    def geometry(self) -> Stretch:
+        return self
 
     @property
     def road(self) -> Road:
@@ -335,7 +340,7 @@ class SumRelease(ReleaseModel):
 
     @classmethod
     def centre(cls, corridor, settings):
-        return 0.5 * corridor.speed_limit
+        return 0.5 * corridor.geometry.speed_limit
 
     def __init__(self, task, traffic):
         super().__init__(task, traffic)
@@ -347,9 +352,9 @@ class SumRelease(ReleaseModel):
     def true_values(self, request):
         """Return what is released before noise is added, shape (k, n_columns, 2)."""
         task, corridor = self.task, self.task.corridor
-        every = corridor.n_segments + corridor.n_boundaries
+        every = corridor.geometry.n_segments + corridor.geometry.n_boundaries
         values = self.traffic.aggregates(request.traffic, request.times, every)
-        values[..., 1] = values[..., 0] * (values[..., 1] - 0.5 * corridor.speed_limit)
+        values[..., 1] = values[..., 0] * (values[..., 1] - 0.5 * corridor.geometry.speed_limit)
         weights = task.covers / task.channels.span[:, None]
         return np.einsum("cs,nsk->nck", weights, values[:, : task.n_cells])
 
@@ -368,7 +373,7 @@ class PricedRelease(SumRelease):
     def __init__(self, task, traffic):
         super().__init__(task, traffic)
         self.prices = np.zeros((task.n_episodes, task.queries.n_options))
-        self.spent_share = np.zeros((task.n_episodes, task.corridor.n_mainline))
+        self.spent_share = np.zeros((task.n_episodes, task.corridor.geometry.n_mainline))
 
     def reset(self, episodes, generators):
         super().reset(episodes, generators)

@@ -325,7 +325,8 @@ MUTANTS = (
     ),
     Mutant(
         "flows are not centred on the middle of the speeds", 12, "release/model.py",
-        "return 0.5 * corridor.largest_speed_limit", "return 0.4 * corridor.largest_speed_limit",
+        "return 0.5 * corridor.geometry.largest_speed_limit",
+        "return 0.4 * corridor.geometry.largest_speed_limit",
         "test_guarantee.py",
     ),
     Mutant(
@@ -335,8 +336,8 @@ MUTANTS = (
     ),
     Mutant(
         "the noise is that of the longest segment", 12, "release/gaussian.py",
-        "segment_length=min(corridor.segment_lengths),\n            largest_speed",
-        "segment_length=max(corridor.segment_lengths),\n            largest_speed",
+        "segment_length=min(corridor.geometry.segment_lengths),\n            largest_speed",
+        "segment_length=max(corridor.geometry.segment_lengths),\n            largest_speed",
         "release/test_gaussian.py",
     ),
     Mutant(

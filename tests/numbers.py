@@ -9,7 +9,6 @@ those of whole episodes.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import io
 import json
@@ -85,7 +84,7 @@ Numbers = dict[str, Any]
 @functools.cache
 def _uneven_road() -> str:
     path = Path(tempfile.mkdtemp()) / "uneven.toml"
-    write_corridor(path, dataclasses.replace(UNEVEN, duration=300), {"parameters": "w99-3lane"})
+    write_corridor(path, UNEVEN.replaced(duration=300), {"parameters": "w99-3lane"})
     return str(path)
 
 

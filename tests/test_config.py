@@ -58,6 +58,7 @@ WHOLE = [
 def test_a_whole_configuration_survives_json_and_a_spec(keywords):
     config = resolve("paper-highway", json.loads(json.dumps(keywords)))
     plain = {name: dataclasses.asdict(config)[name] for name in KEYWORDS}
+    plain["corridor"] = config.corridor.fields()
     if keywords.get("privacy") == SUMS:
         plain["privacy"]["preset"] = SUMS
     assert resolve("short-highway", json.loads(json.dumps(plain))) == config
@@ -74,7 +75,7 @@ def test_every_privacy_keyword_is_reachable_from_json():
 
 def test_partial_overrides_keep_the_rest():
     config = resolve("paper-highway", {"corridor": {"duration": 650}, "privacy": "corrected"})
-    assert config.corridor == dataclasses.replace(PAPER_HIGHWAY, duration=650)
+    assert config.corridor == PAPER_HIGHWAY.replaced(duration=650)
     assert (config.privacy.preset, config.privacy.epsilon) == ("corrected", 1.0)
     config = resolve("paper-highway", {"privacy": {"delta": 0.01}, "epsilon": 2})
     assert (config.privacy.epsilon, config.privacy.delta) == (2.0, 0.01)
@@ -92,16 +93,16 @@ def test_partial_overrides_keep_the_rest():
 
 def test_incident_and_demand_by_name():
     config = resolve("paper-highway", {"incident": "random", "demand": "random"})
-    assert isinstance(config.corridor.incident, IncidentDistribution)
-    assert isinstance(config.corridor.demand, DemandDistribution)
-    assert resolve("paper-highway", {"incident": "none"}).corridor.incident is None
+    assert isinstance(config.corridor.conditions.incident, IncidentDistribution)
+    assert isinstance(config.corridor.conditions.demand, DemandDistribution)
+    assert resolve("paper-highway", {"incident": "none"}).corridor.conditions.incident is None
     assert resolve("paper-highway", {"incident": "preset"}).corridor == PAPER_HIGHWAY
     fields = {"corridor": {"incident": "none", "demand": "random", "duration": 600}}
-    road = dataclasses.replace(config.corridor, incident=None, duration=600)
+    road = config.corridor.replaced(incident=None, duration=600)
     assert resolve("paper-highway", fields).corridor == road
     moved = resolve("paper-highway", {"incident": {"segment": 3}})
-    assert moved.corridor.incident.segment == 3
-    assert moved.corridor.incident.phases == PAPER_HIGHWAY.incident.phases
+    assert moved.corridor.conditions.incident.segment == 3
+    assert moved.corridor.conditions.incident.phases == PAPER_HIGHWAY.conditions.incident.phases
 
 
 # --- settings of estimators -----------------------------------------------------------------------
@@ -193,7 +194,7 @@ def test_neither_bandwidth_nor_sensors_enter_an_honest_bound_but_the_papers():
     private = {"privacy": {"boundary_inputs": "private"}}
     fewer, more = (make_release(resolve("paper-highway", k)).sensitivity[0] for k in ({}, private))
     assert dict(fewer.assumptions)["n_sensors"] == 8
-    assert dict(more.assumptions)["n_sensors"] == 8 + PAPER_HIGHWAY.n_boundaries
+    assert dict(more.assumptions)["n_sensors"] == 8 + PAPER_HIGHWAY.geometry.n_boundaries
 
 
 def test_a_void_guarantee_is_warned_of_with_its_reason():

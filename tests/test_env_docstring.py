@@ -88,9 +88,14 @@ def test_its_ids_are_those_that_are_registered():
     for name, n, segments, record, release, bandwidth, traffic in rows:
         config = PRESETS[ENVIRONMENTS[f"dptse/{name}"]]
         road, privacy = config.corridor, config.privacy
-        found = (road.n_mainline, road.n_segments, road.duration, config.bandwidth)
+        found = (
+            road.geometry.n_mainline,
+            road.geometry.n_segments,
+            road.conditions.duration,
+            config.bandwidth,
+        )
         assert found == (int(n), int(segments), int(record.removesuffix(" s")), int(bandwidth))
         assert release == f"{privacy.preset}, {privacy.epsilon:g}"
         assert traffic == (
-            "random" if type(road.demand).__name__.endswith("Distribution") else "fixed"
+            "random" if type(road.conditions.demand).__name__.endswith("Distribution") else "fixed"
         )

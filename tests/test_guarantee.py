@@ -108,8 +108,8 @@ HORIZON, DURATION = 30, 33
 COMMON = 4
 """Traffic seed of a record that both worlds have. Theirs are 0 and 1; in 2 and 3 the vehicle that
 differs is alone."""
-ROAD = dataclasses.replace(SHORT_HIGHWAY, duration=DURATION, incident=None)
-PLACES = ROAD.n_segments + ROAD.n_boundaries
+ROAD = SHORT_HIGHWAY.replaced(duration=DURATION, incident=None)
+PLACES = ROAD.geometry.n_segments + ROAD.geometry.n_boundaries
 ESTIMATORS = ("ekf", "random_walk", "recurrent", "ukf", "enkf", "mhe")
 
 
@@ -249,7 +249,7 @@ def configuration(one_of):
     if sensors and one_of(True, False):
         options["detectors"] = one_of(Detectors(dropout=0.3), Detectors(budget_share=0.6))
     return EnvConfig(
-        corridor=dataclasses.replace(ROAD, fixed_sensors=sensors, speed_limit=limit),
+        corridor=ROAD.replaced(fixed_sensors=sensors, speed_limit=limit),
         estimator=estimator,
         privacy=privacy,
         bandwidth=one_of(1, 3, 6),
@@ -270,7 +270,10 @@ def jumps(generator, n_vehicles=1):
 
 def stands(generator):
     """A vehicle that stays where it is."""
-    place, speed = generator.integers(ROAD.n_mainline), generator.choice([0.0, 51.0, 150.0])
+    place, speed = (
+        generator.integers(ROAD.geometry.n_mainline),
+        generator.choice([0.0, 51.0, 150.0]),
+    )
     return np.full((1, DURATION + 1), place), np.full((1, DURATION + 1), speed)
 
 
@@ -397,7 +400,7 @@ class PacedAtOnce(Paced):
         self.pacing = AtOnce(task, self.pacing.budget)
 
 
-EXIT, FAST_ONE, NOBODY = ROAD.n_segments + 1, (1, 150.0), (AWAY, 0.0)
+EXIT, FAST_ONE, NOBODY = ROAD.geometry.n_segments + 1, (1, 150.0), (AWAY, 0.0)
 BOTH_SEE = {"penetration": Known(share=0.5), "detectors": Detectors(budget_share=0.6)}
 OVERLAPPING = {"query_spans": (1, 2)}
 WORST = {
@@ -422,7 +425,7 @@ WORST = {
 @pytest.mark.parametrize(("privacy", "options", "zero", "one"), WORST.values(), ids=WORST)
 def test_the_worst_trips_are_as_far_apart_as_mu_and_no_further(privacy, options, zero, one):
     config = EnvConfig(
-        corridor=dataclasses.replace(ROAD, fixed_sensors=(1,) if options == BOTH_SEE else ()),
+        corridor=ROAD.replaced(fixed_sensors=(1,) if options == BOTH_SEE else ()),
         estimator="open_loop",
         privacy=privacy,
         bandwidth=6,

@@ -20,7 +20,7 @@ from dptse_env.traffic import write_corridor
 from tests.helpers import UNEVEN, fast_and_slow, play
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
-ROAD = dataclasses.replace(UNEVEN, duration=120)
+ROAD = UNEVEN.replaced(duration=120)
 FAST = [
     {"estimator": "enkf", "privacy": "capped"},
     {"estimator": "mhe", "privacy": "paced"},
@@ -73,7 +73,7 @@ def test_a_count_scatters_less_in_density_on_a_longer_segment():
     model = ARZModel(ROAD.road, load_parameters("w99-3lane"))
     variance = count_variance(model, EstimatorSettings(count_noise=2.0))
     np.testing.assert_allclose(
-        variance * ROAD.segment_lengths, 2.0 / model.density_scale**2, rtol=1e-12
+        variance * ROAD.geometry.segment_lengths, 2.0 / model.density_scale**2, rtol=1e-12
     )
 
 
@@ -87,7 +87,7 @@ def test_a_network_on_a_road_unlike_those_it_was_trained_on_says_so(road_file):
 
 def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):
     road = tmp_path / "short.toml"
-    write_corridor(road, dataclasses.replace(ROAD, segment_length=(0.1,) * 7 + (0.04,)))
+    write_corridor(road, ROAD.replaced(segment_length=(0.1,) * 7 + (0.04,)))
     message = r"short\.toml: corridor\.segment_length must be at least 0\.0567 km .*, got 0\.04 km"
     with pytest.raises(ValueError, match=message + ".* an estimator .*: random_walk, recurrent"):
         make(str(road), parameters="paper")
@@ -97,13 +97,13 @@ def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):
         make(str(road))
     with pytest.raises(ValueError, match=r"^estimator_settings\.mhe\.horizon must be"):
         make(str(road), **table)
-    write_corridor(road, dataclasses.replace(ROAD, segment_length=(0.1,) * 7 + (0.04,)))
+    write_corridor(road, ROAD.replaced(segment_length=(0.1,) * 7 + (0.04,)))
     # A random walk does not step the model.
     make(str(road), parameters="paper", estimator="random_walk").reset(seed=0)
 
 
 def test_a_ramp_that_is_too_short_is_named_as_the_file_has_it(tmp_path):
-    road = dataclasses.replace(ROAD, ramp_length=0.05)
+    road = ROAD.replaced(ramp_length=0.05)
     write_corridor(tmp_path / "ramp.toml", road)
     with pytest.raises(
         ValueError, match=r"ramp\.toml: corridor\.ramp_length must be at least 0\.05"

@@ -101,11 +101,11 @@ def test_an_episode_is_scored_against_the_record_at_its_second(start):
     corridor, n = process.config.corridor, 6
     record, reward = RecordLibrary().get(corridor, 1), None
     for k in range(60):
-        density = record.counts[start + k, :n] / corridor.segment_length
+        density = record.counts[start + k, :n] / corridor.geometry.segment_length
         error = np.sqrt(np.mean((process.estimate.density[:, :n] - density) ** 2, axis=1))
         np.testing.assert_allclose(process.infos(TWO)["rmse_density"], error, rtol=1e-12)
         if reward is not None:
-            np.testing.assert_allclose(reward, -error / corridor.density_scale, rtol=1e-12)
+            np.testing.assert_allclose(reward, -error / corridor.scales.density_scale, rtol=1e-12)
         reward = process.step(TWO, np.ones((2, 6), dtype=np.int8)).reward
 
 

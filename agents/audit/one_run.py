@@ -136,7 +136,7 @@ def make_design(config: EnvConfig, slot: int, kind: str) -> Design:
                 Trajectory.constant(seconds + 1, int(task.channels.first[each]), 0.0)
                 for each in (pair[0], pair[-1])
             )
-            fast = np.full(slot, config.corridor.largest_speed_limit)
+            fast = np.full(slot, config.corridor.geometry.largest_speed_limit)
             other = {
                 "elsewhere": elsewhere,
                 "fast": replace(stands, speed=fast),

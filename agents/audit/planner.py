@@ -95,9 +95,12 @@ class Planner:
         self._budget = float(terms.budget[0])
         # Where all seconds cost the same, the number of those that count.
         self._cap = int(min(self._budget, config.horizon_steps))
-        self._limits = np.array(corridor.with_boundaries(corridor.speed_limits))
+        self._limits = np.array(corridor.geometry.with_boundaries(corridor.geometry.speed_limits))
         # Record columns that are observed without a query.
-        boundaries = range(corridor.n_segments, corridor.n_segments + corridor.n_boundaries)
+        boundaries = range(
+            corridor.geometry.n_segments,
+            corridor.geometry.n_segments + corridor.geometry.n_boundaries,
+        )
         is_private = config.privacy.boundary == "private"
         self._always = [*corridor.fixed_sensors, *(boundaries if is_private else ())]
         self._seconds = np.arange(1, config.horizon_steps + 1)
@@ -202,12 +205,12 @@ class Planner:
         speed most. With two groups of columns sensors come first, where both see the vehicle.
         """
         corridor = self.config.corridor
-        load = record.counts[:, : corridor.n_mainline].sum(axis=0)
-        fixed = np.isin(np.arange(corridor.n_mainline), corridor.fixed_sensors)
+        load = record.counts[:, : corridor.geometry.n_mainline].sum(axis=0)
+        fixed = np.isin(np.arange(corridor.geometry.n_mainline), corridor.fixed_sensors)
         quiet: list[int] = np.lexsort((load, fixed)).tolist()
         if self._is_whole:
             return quiet
-        sensors = [each for each in corridor.fixed_sensors if each < corridor.n_mainline]
+        sensors = [each for each in corridor.fixed_sensors if each < corridor.geometry.n_mainline]
         return list(dict.fromkeys([*sensors[-1:], *sensors, *quiet]))
 
     def _opposite(self, record: Record) -> Pair:
@@ -216,7 +219,10 @@ class Planner:
         They are on the road in the better half of the seconds: where the centre is near the speed
         limit, both are below it or at it.
         """
-        limit, places = self.config.corridor.largest_speed_limit, np.array(self._places(record))
+        limit, places = (
+            self.config.corridor.geometry.largest_speed_limit,
+            np.array(self._places(record)),
+        )
         _, centre = self._typical(record)
         centres = centre[self._seconds - 1][:, places]
         centres = np.nan_to_num(centres, nan=0.5 * limit)
@@ -299,7 +305,7 @@ class Planner:
         if self._release.has_prices or not self._is_whole:
             # A vehicle tells as much as it pays, or is seen twice: queries need not be saved.
             # Where the bandwidth does not suffice for both vehicles, it serves them by turns.
-            on_mainline = vehicle.segment < self.config.corridor.n_mainline
+            on_mainline = vehicle.segment < self.config.corridor.geometry.n_mainline
             chosen = vehicle.only(seen & (~always if self._is_whole else on_mainline))
             costs, n_queries = ((chosen.step - 1 + world) % 2).astype(float), len(chosen.step)
         else:
@@ -370,7 +376,7 @@ class Planner:
         if is_public:
             queried = self._queries.covered(public_plan(self.config, self.policy))
         seconds = slice(1, self.config.horizon_steps + 1)
-        observed[seconds, : self.config.corridor.n_mainline] = queried
+        observed[seconds, : self.config.corridor.geometry.n_mainline] = queried
         observed[seconds, self._always] = True
         return observed
 

@@ -72,7 +72,7 @@ class Mutations:
         self._is_event, self._n_trips = planner.is_event, 2 if planner.replaces else 1
         self._queries, self._covers = task.queries, task.covers
         self._places = np.flatnonzero(task.covers.any(axis=0))
-        self._fastest = 1.2 * config.corridor.largest_speed_limit
+        self._fastest = 1.2 * config.corridor.geometry.largest_speed_limit
 
     def start(self, generator: np.random.Generator) -> Pair:
         """Return a random pair, and random queries."""

@@ -242,8 +242,10 @@ def _roads(parts: Sequence[Episodes]) -> Roads:
         limit.append(np.full(k * S, cells.limit))
         offsets = first + S * np.arange(k)[:, None, None]
         edges.append((corridor.road.edges + offsets).reshape(-1, 2))
-        scales.append(np.tile([corridor.density_scale, corridor.speed_scale], (k * S, 1)))
-        mainline.append(np.tile(np.arange(S) < corridor.n_mainline, k))
+        scales.append(
+            np.tile([corridor.scales.density_scale, corridor.scales.speed_scale], (k * S, 1))
+        )
+        mainline.append(np.tile(np.arange(S) < corridor.geometry.n_mainline, k))
         episode.append(n_episodes + np.repeat(np.arange(k), S))
         ordinary.append(np.full(k, not part.is_section))
         first, n_episodes = first + k * S, n_episodes + k

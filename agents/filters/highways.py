@@ -17,10 +17,10 @@ from scipy.ndimage import uniform_filter1d
 
 from dptse_env.importers.folder import ROAD, save_records
 from dptse_env.importers.measured import measure
-from dptse_env.traffic import Corridor, Record, RecordLibrary
+from dptse_env.traffic import Conditions, Corridor, Geometry, Record, RecordLibrary, Scales
 from dptse_env.traffic.demand import Demand, Drivers, Incident, VehicleClass
 from dptse_env.traffic.imported import Kind
-from dptse_env.traffic.roads import DENSITY_SCALE, write_corridor
+from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 DURATION, WARM_UP = 1150, 100
@@ -66,19 +66,19 @@ def draw_highway(number: int) -> Corridor:
     on = tuple(face for face, is_entry in faces if is_entry)
     off = tuple(face for face, is_entry in faces if not is_entry)
     demand = _draw_demand(rng, CAPACITY * most, len(on))
-    return Corridor(
-        name=f"highway-{number}",
+    geometry = Geometry(
         n_mainline=n,
         on_ramps=on,
         off_ramps=off,
         exit_shares=tuple(round(float(rng.uniform(0.03, 0.2)), 3) for _ in off),
-        demand=demand,
-        incident=_draw_bottlenecks(rng, n),
-        fixed_sensors=(),
-        duration=DURATION,
         lanes=lanes,
         segment_length=length,
         speed_limit=limit,
+    )
+    conditions = Conditions(
+        demand=demand,
+        incident=_draw_bottlenecks(rng, n),
+        duration=DURATION,
         drivers=Drivers(
             model=model,  # type: ignore[arg-type]
             headway=round(float(rng.uniform(*HEADWAYS[model])), 2),
@@ -86,6 +86,8 @@ def draw_highway(number: int) -> Corridor:
         ),
         vehicle_classes=classes,
     )
+    scales = Scales.of(geometry, average_dwell=8.0)
+    return Corridor(f"highway-{number}", geometry, conditions, scales)
 
 
 def _draw_ramps(rng: np.random.Generator, n: int) -> list[tuple[int, bool]]:
@@ -180,16 +182,16 @@ class Section:
             cuts = [_averaged(road, each, self.averaged) for each in cuts]
         sources = [{"seed": seed, "start": start} for seed, start in enumerate(starts)]
         kept = save_records(folder, road, cuts, sources, kind)
-        write_corridor(folder / ROAD, dataclasses.replace(road, recordings=kept))
+        write_corridor(folder / ROAD, road.replaced(recordings=kept))
         return folder / ROAD
 
     def _place(self, highway: Corridor, record: Record) -> tuple[int, list[int]]:
         """Return the first segment and the windows' starts; where there are queues is likelier."""
         rng = np.random.default_rng([78, self.highway, self.segments, self.seed])
-        n = highway.n_mainline
+        n = highway.geometry.n_mainline
         lengths, limits = (
-            np.array(highway.with_boundaries(each))
-            for each in (highway.segment_lengths, highway.speed_limits)
+            np.array(highway.geometry.with_boundaries(each))
+            for each in (highway.geometry.segment_lengths, highway.geometry.speed_limits)
         )
         density, speed = np.moveaxis(record.traffic(lengths, limits)[:, :n], -1, 0)
         is_slow, is_empty = speed < SLOW * limits[:n], density.sum(axis=1) == 0.0
@@ -213,39 +215,38 @@ class Section:
 
 def _section(highway: Corridor, first: int, section: Section) -> tuple[Corridor, IntArray]:
     """Return a section as a road, and the highway's record column of each of its own."""
-    n, lanes = section.segments, highway.segment_lanes[first : first + section.segments]
+    n, lanes = section.segments, highway.geometry.segment_lanes[first : first + section.segments]
     mainline = range(first, first + n)
 
     def inside(faces: tuple[int, ...]) -> list[int]:
         return [k for k, face in enumerate(faces) if first < face < first + n]
 
-    on, off = inside(highway.on_ramps), inside(highway.off_ramps)
-    before = highway.n_segments + 2  # then the boundary segments of ramps, on-ramps first
+    on, off = inside(highway.geometry.on_ramps), inside(highway.geometry.off_ramps)
+    before = highway.geometry.n_segments + 2  # then the boundary segments of ramps, on-ramps first
     columns = [
         *mainline,
-        *(highway.on_ramp_segments[k][0] for k in on),
-        *(highway.off_ramp_segments[k][0] for k in off),
+        *(highway.geometry.on_ramp_segments[k][0] for k in on),
+        *(highway.geometry.off_ramp_segments[k][0] for k in off),
         first - 1,
         first + n,
         *(before + k for k in on),
-        *(before + highway.n_on_ramps + k for k in off),
+        *(before + highway.geometry.n_on_ramps + k for k in off),
     ]
-    road = dataclasses.replace(
-        highway,
-        name=f"{highway.name}-{first}",
+    geometry = dataclasses.replace(
+        highway.geometry,
         n_mainline=n,
-        on_ramps=tuple(highway.on_ramps[k] - first for k in on),
-        off_ramps=tuple(highway.off_ramps[k] - first for k in off),
-        exit_shares=tuple(highway.exit_shares[k] for k in off),
-        demand=Demand(mainline=((0.0, 0.0),), on_ramps=(0.0,) * len(on)),
-        incident=None,
-        fixed_sensors=section.sensors,
-        duration=section.seconds,
+        on_ramps=tuple(highway.geometry.on_ramps[k] - first for k in on),
+        off_ramps=tuple(highway.geometry.off_ramps[k] - first for k in off),
+        exit_shares=tuple(highway.geometry.exit_shares[k] for k in off),
         lanes=lanes,
-        density_scale=DENSITY_SCALE * max(lanes),
-        speed_scale=highway.largest_speed_limit,
-        drivers=Drivers(),
-        vehicle_classes=(),
+    )
+    demand = Demand(mainline=((0.0, 0.0),), on_ramps=(0.0,) * len(on))
+    road = Corridor(
+        name=f"{highway.name}-{first}",
+        geometry=geometry,
+        conditions=Conditions(demand, section.seconds),
+        scales=Scales.of(geometry, average_dwell=8.0),
+        fixed_sensors=section.sensors,
     )
     return road, np.array(columns)
 
@@ -278,7 +279,7 @@ def _averaged(road: Corridor, record: Record, seconds: int) -> Record:
     )
     # Sums of a running window leave rests of some 1e-13 where it is empty again.
     least = 0.5 / seconds
-    lengths = np.array(road.with_boundaries(road.segment_lengths))
+    lengths = np.array(road.geometry.with_boundaries(road.geometry.segment_lengths))
     density = np.where(counts < least, 0.0, counts) / lengths
     speed = np.maximum(speeds, 0.0) / np.maximum(counts, least)
     return Record(

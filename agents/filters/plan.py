@@ -197,7 +197,7 @@ class FilterPlan:
     def validation_sections(self) -> list[Section]:
         """Return the sections that are validated on, with queues of any kind."""
         numbers = range(*self.validation_highways)
-        longest = [draw_highway(number).n_mainline - 2 for number in numbers]
+        longest = [draw_highway(number).geometry.n_mainline - 2 for number in numbers]
         return [
             Section(number, min(8 + 2 * (k % 6), most), 4, self.seconds)
             for k, (number, most) in enumerate(zip(numbers, longest, strict=True))
@@ -229,10 +229,12 @@ class FilterPlan:
         ranges = self.ranges
         roads = [make_config(*parse_env(each)).corridor for each in ranges.envs]
         found: dict[str, list[float]] = {
-            "n_mainline": [float(road.n_mainline) for road in roads],
-            "segment_length": [length for road in roads for length in road.segment_lengths],
-            "speed_limit": [limit for road in roads for limit in road.speed_limits],
-            "lanes": [float(count) for road in roads for count in road.segment_lanes],
+            "n_mainline": [float(road.geometry.n_mainline) for road in roads],
+            "segment_length": [
+                length for road in roads for length in road.geometry.segment_lengths
+            ],
+            "speed_limit": [limit for road in roads for limit in road.geometry.speed_limits],
+            "lanes": [float(count) for road in roads for count in road.geometry.segment_lanes],
             "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
             "flows": [float(self.kind == "flows")],
         }
@@ -271,6 +273,6 @@ class FilterPlan:
             for cell in cells:
                 cell.check()
             for env in self.ranges.envs:
-                most = make_config(*parse_env(env)).corridor.duration
+                most = make_config(*parse_env(env)).corridor.conditions.duration
                 allowed = f"at most {most} s, the length of a record of {env}"
                 require(self.seconds <= most, "plan.seconds", allowed, self.seconds)

@@ -173,10 +173,10 @@ class ScenarioRanges:
         else:
             env, keywords = parse_env(str(rng.choice(self.envs)))
             corridor = make_config(env, keywords).corridor
-            n_mainline = corridor.n_mainline
+            n_mainline = corridor.geometry.n_mainline
             drawn = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
             seeds = tuple(int(seed) for seed in drawn)
-            keywords |= {"horizon": seconds, "random_start": seconds < corridor.duration}
+            keywords |= {"horizon": seconds, "random_start": seconds < corridor.conditions.duration}
         privacy = self._draw_privacy(rng, mechanism)
         if section is not None or rng.random() < 0.3:
             chances = dict(BOUNDARIES[kind])
@@ -204,7 +204,7 @@ class ScenarioRanges:
         self, rng: np.random.Generator, windows: int, seconds: int, averaged: bool
     ) -> Section:
         number = int(rng.integers(*self.highways))
-        most = min(draw_highway(number).n_mainline - 2, SEGMENTS[1])
+        most = min(draw_highway(number).geometry.n_mainline - 2, SEGMENTS[1])
         fewest = SEGMENTS[0]
         segments = int(np.exp(rng.uniform(np.log(fewest), np.log(min(20, most) + 1.0))))
         if rng.random() < 0.1:

@@ -200,14 +200,14 @@ def image(figure: Figure) -> str:
 
 def draw_road(corridor: Corridor) -> Figure:
     """Draw segments to scale along the road, lanes across it, ramps beside it, and sensors."""
-    n, lengths = corridor.n_mainline, np.array(corridor.segment_lengths)
+    n, lengths = corridor.geometry.n_mainline, np.array(corridor.geometry.segment_lengths)
     starts = np.concatenate([[0.0], np.cumsum(lengths[:n])])
     figure = make_figure(9.0, 2.4, dpi=120)
     axis = figure.subplots()
-    most = corridor.most_lanes
+    most = corridor.geometry.most_lanes
 
     def box(segment: int, left: float, bottom: float, colour: str) -> None:
-        width, lanes = float(lengths[segment]), corridor.segment_lanes[segment]
+        width, lanes = float(lengths[segment]), corridor.geometry.segment_lanes[segment]
         axis.add_patch(Rectangle((left, bottom), width, lanes, facecolor=colour, edgecolor="white"))
         middle = (left + width / 2, bottom + lanes / 2)
         axis.annotate(f"{segment}", middle, ha="center", va="center", fontsize=7)
@@ -216,26 +216,26 @@ def draw_road(corridor: Corridor) -> Figure:
 
     for segment in range(n):
         box(segment, float(starts[segment]), 0.0, "#c9d6e3")
-    groups = [(*corridor.on_ramps, *corridor.off_ramps)]
-    ramps = (*corridor.on_ramp_segments, *corridor.off_ramp_segments)
+    groups = [(*corridor.geometry.on_ramps, *corridor.geometry.off_ramps)]
+    ramps = (*corridor.geometry.on_ramp_segments, *corridor.geometry.off_ramp_segments)
     for face, segments in zip(*groups, ramps, strict=True):
-        joins = segments[0] in {s for each in corridor.on_ramp_segments for s in each}
+        joins = segments[0] in {s for each in corridor.geometry.on_ramp_segments for s in each}
         left = float(starts[face])
         if joins:
             left -= float(lengths[list(segments)].sum())
         for segment in segments:
-            box(segment, left, -1.6 - corridor.segment_lanes[segment], "#e3d6c9")
+            box(segment, left, -1.6 - corridor.geometry.segment_lanes[segment], "#e3d6c9")
             left += float(lengths[segment])
         place = float(starts[face])
         ends = ((place, -0.05), (place, -1.5)) if joins else ((place, -1.5), (place, -0.05))
         axis.annotate("", *ends, arrowprops={"arrowstyle": "->", "color": "#777"})
-    limits = corridor.speed_limits[:n]
+    limits = corridor.geometry.speed_limits[:n]
     for segment in range(n):
         if segment == 0 or limits[segment] != limits[segment - 1]:
             at = (float(starts[segment]), most + 0.3)
             axis.annotate(f"{limits[segment]:g} km/h", at, fontsize=7, color="#555")
     axis.set_xlim(-0.02 * starts[-1], 1.02 * starts[-1])
-    axis.set_ylim(-4.2 if corridor.n_ramps else -0.6, most + 1.2)
+    axis.set_ylim(-4.2 if corridor.geometry.n_ramps else -0.6, most + 1.2)
     axis.set_yticks([])
     axis.set_xlabel("road [km]; traffic goes right, triangles are fixed sensors", fontsize=8)
     add_frame(axis, "x")
@@ -245,7 +245,7 @@ def draw_road(corridor: Corridor) -> Figure:
 
 def draw_diagram(outcome: Outcome) -> Figure:
     """Draw speeds and flows over densities of the mainline, with the equilibrium of each set."""
-    n = outcome.choice.road.corridor.n_mainline
+    n = outcome.choice.road.corridor.geometry.n_mainline
     density, speed = outcome.density[:, :n].ravel(), outcome.speed[:, :n].ravel()
     occupied = density > 0.0
     density, speed = density[occupied], speed[occupied]

@@ -76,15 +76,15 @@ def traffic_of(
     corridor: Corridor, seeds: Sequence[int], library: RecordLibrary
 ) -> tuple[FloatArray, FloatArray]:
     """Return densities for a lane [veh/km] and speeds [km/h] of all segments, shape (n, S)."""
-    traffic, s = Traffic(corridor, tuple(seeds), library), corridor.n_segments
+    traffic, s = Traffic(corridor, tuple(seeds), library), corridor.geometry.n_segments
     traffic.load(range(len(seeds)))
     tables = np.concatenate([traffic.complete(index)[:, :s] for index in range(len(seeds))])
-    return tables[..., 0] / np.array(corridor.segment_lanes), tables[..., 1]
+    return tables[..., 0] / np.array(corridor.geometry.segment_lanes), tables[..., 1]
 
 
 def start_from(shipped: ARZParameters, corridor: Corridor, name: str) -> ARZParameters:
     """Return a shipped set for the lanes of a road, slowed down until its CFL condition holds."""
-    lanes = max(corridor.segment_lanes[: corridor.n_mainline])
+    lanes = max(corridor.geometry.segment_lanes[: corridor.geometry.n_mainline])
     start = dataclasses.replace(
         shipped,
         name=name,
@@ -132,7 +132,7 @@ def fit_parameters(
         tries: Sets to try at most.
         kept: JSON file of what was tried.
     """
-    limit = corridor.largest_speed_limit
+    limit = corridor.geometry.largest_speed_limit
     low = np.log([0.8 * limit, max(densest, 40.0), 0.1, 5.0])
     high = np.log([2.5 * limit, max(2.0 * densest, 300.0), 5.0, 500.0])
     tried: dict[tuple[float, ...], float] = {}
@@ -220,7 +220,7 @@ def _at_bounds(
         if end is not None:
             number = getattr(parameters, name)
             found.append(f"{name} ended at {number:g}, the {end} tried: {MEANING[name, end]}")
-    shortest = min(corridor.segment_lengths)
+    shortest = min(corridor.geometry.segment_lengths)
     if parameters.largest_time_step(shortest) < 1.02 * TIME_STEP:
         number = parameters.free_flow_speed
         found.append(

@@ -84,7 +84,7 @@ class Road:
 
     def identity(self, tries: int) -> dict[str, Any]:
         """Return what two fits must share for one to go on with what the other has found."""
-        road = dataclasses.asdict(self.corridor)
+        road = self.corridor.fields()
         del road["average_dwell"], road["measured"]  # the fit itself puts them into the file
         content = {
             "road": road,
@@ -119,7 +119,7 @@ class Road:
         # The file that a fit leaves has more under `measured`, and is the same road.
         played = dataclasses.replace(self.corridor, measured=())
         if "average_dwell" in self.assumed:
-            played = dataclasses.replace(played, average_dwell=dwell)
+            played = played.replaced(average_dwell=dwell)
         write_corridor(stages / PLAYED, played)
 
     def measure_dwell(self, library: RecordLibrary) -> float:
@@ -168,12 +168,12 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
     keywords = {k: v for k, v in road.environment.items() if k not in (*CHOSEN, "traffic_seeds")}
     keywords |= given
     base, decided, remarks = PRESETS[preset_of(env)], list[str](), list[str]()
-    third = max(corridor.n_mainline // 3, 1)
+    third = max(corridor.geometry.n_mainline // 3, 1)
     if "bandwidth" not in keywords and third < base.bandwidth:
         keywords["bandwidth"] = third
         decided.append("bandwidth")
         remarks.append(f"bandwidth {third}, a third of the segments")
-    is_field = not has_vehicles(corridor.recordings)
+    is_field = not has_vehicles(corridor.source.recordings)
     needs_vehicles = base.release_model.needs_vehicles
     if is_field and needs_vehicles and "privacy" not in keywords:
         keywords["privacy"] = "corrected"
@@ -198,11 +198,13 @@ def _lies_in(value: Any, folder: Path) -> bool:
 
 def _check_road(path: Path, corridor: Corridor) -> None:
     """Refuse a road without traffic or network, and segments that suit no set of parameters."""
-    if corridor.recordings is None and corridor.network is None:
-        rates = [rate for _, rate in corridor.published_demand.mainline]
+    if corridor.source.recordings is None and corridor.source.network is None:
+        rates = [rate for _, rate in corridor.conditions.published_demand.mainline]
         require(max(rates) > 0.0, f"{path}: demand.mainline", "above 0 veh/h at some time", rates)
-        network_xml(corridor)  # so that netconvert refuses the road, or is missing, at once
-    pairs = zip(corridor.segment_lengths, corridor.speed_limits, strict=True)
+        network_xml(
+            corridor.geometry
+        )  # so that netconvert refuses the road, or is missing, at once
+    pairs = zip(corridor.geometry.segment_lengths, corridor.geometry.speed_limits, strict=True)
     for segment, (length, limit) in enumerate(pairs):
         least = LARGEST_W * limit / HOUR
         if length < 1.02 * least:
@@ -217,7 +219,9 @@ def _seeds_of(
     path: Path, corridor: Corridor, given: Mapping[str, str | None]
 ) -> dict[str, tuple[int, ...]]:
     """Return the seeds of each kind: those given, all that were recorded, or the usual number."""
-    recorded = None if corridor.recordings is None else recorded_seeds(corridor.recordings)
+    recorded = (
+        None if corridor.source.recordings is None else recorded_seeds(corridor.source.recordings)
+    )
     found = {}
     for kind, allowed in KINDS.items():
         text = given[kind]

@@ -229,8 +229,8 @@ def met_epsilon(config: EnvConfig, *, alone: bool = False) -> float:
     """
     density_std, speed_std = (each.noise_std for each in privacy_report(config).releases)
     norm = math.sqrt(2.0 * CAP)  # of the numbers of two vehicles, each at its own places
-    density = norm / min(config.corridor.segment_lengths) / density_std
-    speed = norm * config.corridor.largest_speed_limit / speed_std if alone else 0.0
+    density = norm / min(config.corridor.geometry.segment_lengths) / density_std
+    speed = norm * config.corridor.geometry.largest_speed_limit / speed_std if alone else 0.0
     return epsilon_of(math.hypot(density, speed), config.privacy.delta)
 
 

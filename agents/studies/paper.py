@@ -477,8 +477,8 @@ def draw_sweep(played: Played, field: str, metrics: Sequence[str], columns: int)
 def draw_space_time(table: pl.DataFrame) -> Figure:
     """Draw maps of density: truth on top, then each estimator; a column for each setting."""
     corridor = corridor_of(CELLS[0])
-    lengths = corridor.segment_lengths[: corridor.n_mainline]
-    history = History(0, corridor.duration, lengths, corridor.density_scale)
+    lengths = corridor.geometry.segment_lengths[: corridor.geometry.n_mainline]
+    history = History(0, corridor.conditions.duration, lengths, corridor.scales.density_scale)
     columns = []
     for setting in SETTINGS:
         column: list[RoadMap] = []

@@ -48,8 +48,8 @@ def squared_errors(process: QueryProcess) -> Observation:
     """
     corridor, n = process.config.corridor, process.interface.queries.n_mainline
     truth, estimate = process.truth(np.arange(process.n_episodes))[:, :n], process.estimate
-    density = (estimate.density[:, :n] - truth[..., 0]) / corridor.density_scale
-    speed = (estimate.speed[:, :n] - truth[..., 1]) / corridor.speed_scale
+    density = (estimate.density[:, :n] - truth[..., 0]) / corridor.scales.density_scale
+    speed = (estimate.speed[:, :n] - truth[..., 1]) / corridor.scales.speed_scale
     squared: FloatArray = density**2 + np.where(truth[..., 0] > 0, speed, 0.0) ** 2
     return squared.astype(np.float32)
 

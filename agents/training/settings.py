@@ -270,7 +270,7 @@ class LearnerSettings(Algorithm):
 
     def episode(self, config: EnvConfig) -> dict[str, Any]:
         """Return the keywords of the episodes that it trains on."""
-        most = min(config.horizon_steps, config.corridor.duration // 2)
+        most = min(config.horizon_steps, config.corridor.conditions.duration // 2)
         return {"horizon": min(self.horizon, most), "random_start": True}
 
     def arguments(self, actions_per_step: int) -> dict[str, Any]:
@@ -439,7 +439,7 @@ def parse_algorithm(text: str, n_segments: int) -> Algorithm:
 def fitting(config: EnvConfig) -> list[str]:
     """Return the algorithms that can choose the queries of an environment."""
     every = (PPOSettings.name, f'{PPOSettings.name} {{"policy": "mlp"}}', *list(ALGORITHMS)[1:])
-    n_segments = config.corridor.n_mainline
+    n_segments = config.corridor.geometry.n_mainline
     return [text for text in every if parse_algorithm(text, n_segments).fits(config)]
 
 
@@ -521,7 +521,7 @@ class TrainingPlan:
         for env, keywords in map(parse_env, self.envs):
             config = make_config(env, {**chosen, **keywords})
             first = worlds[0].config if worlds else config
-            share = first.corridor.n_mainline / config.corridor.n_mainline
+            share = first.corridor.geometry.n_mainline / config.corridor.geometry.n_mainline
             worlds.append(World(env, keywords, config, share))
             if not self.algorithm.fits(config):
                 raise ValueError(

@@ -165,10 +165,10 @@ def draw_rewards() -> Figure:
     axis = figure.subplots()
     lines = {
         "a: density error over its scale": (
-            [info["rmse_density"] / road.density_scale for info in infos], BLUE, "-",
+            [info["rmse_density"] / road.scales.density_scale for info in infos], BLUE, "-",
         ),
         "b: speed error over its scale": (
-            [info["rmse_speed"] / road.speed_scale for info in infos], ORANGE, "-",
+            [info["rmse_speed"] / road.scales.speed_scale for info in infos], ORANGE, "-",
         ),
         "minus the reward": ([-reward for _, _, reward, _ in episode], "black", ":"),
     }  # fmt: skip

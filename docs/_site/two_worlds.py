@@ -80,8 +80,8 @@ def draw(config: EnvConfig, worlds: AdjacentWorlds, found: Transcript) -> Figure
     for world, axis in enumerate((first, second)):
         line = LINES[world]
         trip = worlds.trajectories[world]
-        on_road = trip.only(trip.segment < config.corridor.n_mainline)
-        draw_others(axis, worlds.rest, config.corridor.n_mainline)
+        on_road = trip.only(trip.segment < config.corridor.geometry.n_mainline)
+        draw_others(axis, worlds.rest, config.corridor.geometry.n_mainline)
         axis.plot(on_road.step, on_road.segment, **line)
         axis.plot(seconds, found.counted[world], "o", color=line["color"], ms=3.5)
         counts = worlds.get(config.corridor, world).counts[1:, SEGMENT]

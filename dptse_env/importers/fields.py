@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -23,11 +22,12 @@ from dptse_env.importers.folder import (
 from dptse_env.importers.measured import with_measured
 from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
 from dptse_env.importers.units import odd_unit
-from dptse_env.traffic.corridor import SHORTEST_SEGMENT, Corridor
+from dptse_env.traffic.corridor import Conditions, Corridor, Scales
 from dptse_env.traffic.demand import Demand
+from dptse_env.traffic.geometry import SHORTEST_SEGMENT, Geometry
 from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.roads import DENSITY_SCALE, write_corridor
+from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
 from dptse_env.utils.fields import (
     Interval,
@@ -465,13 +465,14 @@ class FieldRoad:
 
     def corridor(self, segment_length: float, duration: int) -> Corridor:
         """Return the road without demand and recordings."""
-        return Corridor(
-            name=self.name, n_mainline=self.segments, on_ramps=(), off_ramps=(), exit_shares=(),
-            demand=Demand(mainline=((0.0, 0.0),)), incident=None, fixed_sensors=(),
-            duration=duration, lanes=self.lanes, segment_length=segment_length,
-            speed_limit=self.speed_limit, density_scale=DENSITY_SCALE * self.lanes,
-            speed_scale=self.speed_limit,
-        )  # fmt: skip
+        geometry = Geometry(
+            self.segments,
+            lanes=self.lanes,
+            segment_length=segment_length,
+            speed_limit=self.speed_limit,
+        )
+        conditions = Conditions(Demand(mainline=((0.0, 0.0),)), duration)
+        return Corridor(self.name, geometry, conditions, Scales.of(geometry))
 
 
 def import_field(
@@ -526,7 +527,7 @@ def import_field(
     ]
     with new_folder(output) as folder:
         kept = save_records(folder, bare, records, sources, "fields")
-        written = dataclasses.replace(measured, recordings=kept)
+        written = measured.replaced(recordings=kept)
         comment = "A measured field. Demand and average dwell are those of its training windows."
         write_corridor(folder / ROAD, written, comment=comment)
     return moved(written, output), seeds

@@ -99,8 +99,8 @@ def import_trajectories(
     once = len({path.resolve() for path in files}) == len(files)
     require(once, "files", "given once each", [str(path) for path in files])
     check_splits(splits)
-    bare = dataclasses.replace(
-        corridor, incident=None, recordings=None, demand=corridor.published_demand
+    bare = corridor.replaced(
+        incident=None, recordings=None, demand=corridor.conditions.published_demand
     )
     with new_folder(output) as folder:
         recordings = [
@@ -123,29 +123,31 @@ def import_trajectories(
                 record = recording.record(window["window"])
                 source_of |= {"vehicles": len(np.unique(record.vehicle)), "rows": record.n_rows}
                 used[:] |= record.counts.any(axis=0)
-                empty.extend([source_of["seed"]] * (not record.counts[0, : bare.n_mainline].any()))
+                empty.extend(
+                    [source_of["seed"]] * (not record.counts[0, : bare.geometry.n_mainline].any())
+                )
                 yield record
 
         kept = save_records(folder, bare, records(), sources)
         notes = [
             f"no vehicle is ever on the {kind}-ramp at face {face}"
             for kind, faces, ramps in (
-                ("on", bare.on_ramps, bare.on_ramp_segments),
-                ("off", bare.off_ramps, bare.off_ramp_segments),
+                ("on", bare.geometry.on_ramps, bare.geometry.on_ramp_segments),
+                ("off", bare.geometry.off_ramps, bare.geometry.off_ramp_segments),
             )
             for face, segments in zip(faces, ramps, strict=True)
             if not used[list(segments)].any()
         ]
         if empty:
             notes.append(f"windows begin on an empty mainline: traffic seeds {ranges(empty)}")
-        notes += _overlaps(sources, corridor.duration)
+        notes += _overlaps(sources, corridor.conditions.duration)
 
         def load(seed: int) -> Record:
             return load_record(kept, seed, bare.record_layout)
 
         # One at a time, so that one is in memory.
         measured = measure(bare, lambda: map(load, seeds[splits[0].name]))
-        road = dataclasses.replace(measured, recordings=kept)
+        road = measured.replaced(recordings=kept)
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
         write_corridor(folder / ROAD, road, environment, comment)
         first = load(flat[0])
@@ -180,9 +182,9 @@ def save_records(
 
 def moved(road: Corridor, output: Path) -> Corridor:
     """Return a road whose recordings are in another folder."""
-    assert road.recordings is not None
-    there = dataclasses.replace(road.recordings, folder=str(output.absolute()))
-    return dataclasses.replace(road, recordings=there)
+    assert road.source.recordings is not None
+    there = dataclasses.replace(road.source.recordings, folder=str(output.absolute()))
+    return road.replaced(recordings=there)
 
 
 def _overlaps(windows: Iterable[Mapping[str, Any]], duration: float) -> list[str]:

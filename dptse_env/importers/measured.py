@@ -1,6 +1,5 @@
 """Demand, exit shares and average dwell of a road, as measured on its records."""
 
-import dataclasses
 import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -40,7 +39,7 @@ def with_measured(
         held = (min(max(share, LEAST_SHARE), 1.0 - LEAST_SHARE) for share in exit_shares)
         values["exit_shares"] = tuple(round(float(share), 4) for share in held)
     values["average_dwell"] = round(average_dwell(corridor, records), 3)
-    return dataclasses.replace(corridor, **values, measured=tuple(values))
+    return corridor.replaced(**values, measured=tuple(values))
 
 
 def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corridor:
@@ -60,22 +59,23 @@ def measure(corridor: Corridor, records: Callable[[], Iterable[Record]]) -> Corr
         [(record.speed_sums.mean(axis=0), record.counts.mean(axis=0)) for record in records()],
         axis=0,
     )
-    empty = np.flatnonzero(counts[: corridor.n_mainline] == 0.0)
+    road = corridor.geometry
+    empty = np.flatnonzero(counts[: road.n_mainline] == 0.0)
     some = "with vehicles on the mainline in the first part of the windows"
-    require(len(empty) < corridor.n_mainline, "files", some, "none there")
+    require(len(empty) < road.n_mainline, "files", some, "none there")
     if len(empty):
         warnings.warn(
             f"no vehicle is on the mainline's segments {ranges(empty + 1)} of "
-            f"{corridor.n_mainline}: are layout.origin and the unit of lengths right?",
+            f"{road.n_mainline}: are layout.origin and the unit of lengths right?",
             stacklevel=3,
         )
-    flow = sums[: corridor.n_segments] / np.array(corridor.segment_lengths)
+    flow = sums[: road.n_segments] / np.array(road.segment_lengths)
     demand = Demand(
         mainline=((0.0, round(float(flow[0]), 1)),),
-        on_ramps=tuple(round(float(flow[each[-1]]), 1) for each in corridor.on_ramp_segments),
+        on_ramps=tuple(round(float(flow[each[-1]]), 1) for each in road.on_ramp_segments),
     )
     shares = [
         flow[segments[0]] / max(flow[face - 1], 1e-9)
-        for face, segments in zip(corridor.off_ramps, corridor.off_ramp_segments, strict=True)
+        for face, segments in zip(road.off_ramps, road.off_ramp_segments, strict=True)
     ]
     return with_measured(corridor, records(), demand, shares)

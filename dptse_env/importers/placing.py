@@ -28,8 +28,8 @@ class Branches:
     def __init__(self, corridor: Corridor) -> None:
         """Lay the columns along the road."""
         self.corridor = corridor
-        n, first = corridor.n_mainline, corridor.n_segments
-        lengths = np.array(corridor.with_boundaries(corridor.segment_lengths))
+        n, first = corridor.geometry.n_mainline, corridor.geometry.n_segments
+        lengths = np.array(corridor.geometry.with_boundaries(corridor.geometry.segment_lengths))
         self.faces = np.concatenate([[0.0], np.cumsum(lengths[:n])])
         start, end = -lengths[first], self.faces[-1] + lengths[first + 1]
         self.starts: list[FloatArray] = []
@@ -38,17 +38,21 @@ class Branches:
         """Columns of each branch."""
         self._add([start, *self.faces, end], [first, *range(n), first + 1])
         boundary = itertools.count(first + 2)
-        for face, segments in zip(corridor.on_ramps, corridor.on_ramp_segments, strict=True):
+        for face, segments in zip(
+            corridor.geometry.on_ramps, corridor.geometry.on_ramp_segments, strict=True
+        ):
             ramp = [next(boundary), *segments]
             before = self.faces[face] - np.cumsum(lengths[ramp][::-1])[::-1]
             starts = [*before, *self.faces[face:], end]
             self._add(starts, [*ramp, *range(face, n), first + 1])
-        for face, segments in zip(corridor.off_ramps, corridor.off_ramp_segments, strict=True):
+        for face, segments in zip(
+            corridor.geometry.off_ramps, corridor.geometry.off_ramp_segments, strict=True
+        ):
             ramp = [*segments, next(boundary)]
             after = self.faces[face] + np.cumsum(lengths[ramp])
             starts = [start, *self.faces[: face + 1], *after]
             self._add(starts, [first, *range(face), *ramp])
-        self.n_branches = 1 + corridor.n_ramps
+        self.n_branches = 1 + corridor.geometry.n_ramps
 
     def _add(self, starts: list[float], columns: list[int]) -> None:
         self.starts.append(np.array(starts))
@@ -57,7 +61,7 @@ class Branches:
     @property
     def column_starts(self) -> tuple[NDArray[np.int16], FloatArray]:
         """Branch of each record column, and the position at which it starts [km]."""
-        n_columns = self.corridor.n_segments + self.corridor.n_boundaries
+        n_columns = self.corridor.geometry.n_segments + self.corridor.geometry.n_boundaries
         branch, start = np.zeros(n_columns, dtype=np.int16), np.zeros(n_columns)
         for number in reversed(range(self.n_branches)):
             columns = self.columns[number][:-1]
@@ -95,7 +99,10 @@ def placed(
         ValueError: The layout does not fit the road.
     """
     corridor = branches.corridor
-    for name, n in (("on_ramps", corridor.n_on_ramps), ("off_ramps", corridor.n_off_ramps)):
+    for name, n in (
+        ("on_ramps", corridor.geometry.n_on_ramps),
+        ("off_ramps", corridor.geometry.n_off_ramps),
+    ):
         strips = getattr(layout, name)
         allowed = f"one strip for each of the {n} {name.replace('_', '-')} at most"
         require(len(strips) <= n, f"layout.{name}", allowed, len(strips))
@@ -118,7 +125,7 @@ def placed(
         return points.with_columns(column=column, lane_number=number)
     position = pl.col("x") - layout.origin * unit
     points = points.with_columns(
-        branch=_branch(layout, corridor.n_on_ramps, unit),
+        branch=_branch(layout, corridor.geometry.n_on_ramps, unit),
         position=-position if layout.reversed else position,
     )
     return points.with_columns(column=column_at(branches), lane_number=number)
@@ -138,7 +145,7 @@ def column_at(branches: Branches) -> pl.Expr:
 
 def _edges(layout: Layout, branches: Branches) -> pl.LazyFrame:
     """Return branch, start [km] and column of each edge; null for the mainline by position."""
-    names = edge_ids(branches.corridor)
+    names = edge_ids(branches.corridor.geometry)
     numbers, starts = branches.column_starts
     edges: list[tuple[str, int, float, int | None]] = []
     for name, value in (layout.edges or {each: each for each in names}).items():

@@ -139,17 +139,18 @@ class Recording:
             vehicle=found["number"].to_numpy(),
             segment=found["column"].to_numpy(),
             speed=found["speed"].to_numpy(),
-            n_steps=corridor.duration + 1,
-            n_columns=corridor.n_segments + corridor.n_boundaries,
+            n_steps=corridor.conditions.duration + 1,
+            n_columns=corridor.geometry.n_segments + corridor.geometry.n_boundaries,
         )
 
     def points(self) -> pl.DataFrame:
         """Return points of the first window on the mainline for a picture, some where many."""
         _, group, _, start = self.windows.row(0)
         time = pl.col("time") + (self.shift - start)
+        duration = self.branches.corridor.conditions.duration
         here = (pl.col("branch") == 0) & (pl.col("column") != OFF) & (pl.col("group") == group)
         points = (
-            self._points.filter(here, time.is_between(0.0, self.branches.corridor.duration))
+            self._points.filter(here, time.is_between(0.0, duration))
             .select(time, "position", "speed")
             .collect(engine="streaming")
         )
@@ -305,7 +306,7 @@ class Recording:
 
         A silence parts a group into recordings. Those that are shorter than a window have none.
         """
-        c, stride = pl.col, self.branches.corridor.duration + 1 + self.options.pause
+        c, stride = pl.col, self.branches.corridor.conditions.duration + 1 + self.options.pause
         wait = c("begin") - c("end").shift()
         pauses = wait.is_between(LONGEST_PAUSE, LONGEST_SILENCE).over("group")
         part = (c("second").diff() > LONGEST_SILENCE).fill_null(False).cum_sum().over("group")
@@ -342,9 +343,10 @@ class Recording:
             )
         if kept.is_empty():
             longest = (parts["last"] - parts["first"]).to_numpy().max() + 1
+            duration = self.branches.corridor.conditions.duration
             silences = f" between silences of over {LONGEST_SILENCE:g} s" if len(parts) > 1 else ""
             raise TrajectoryError(
-                f"{self.path}: it must last {self.branches.corridor.duration + 1} s or more, the "
+                f"{self.path}: it must last {duration + 1} s or more, the "
                 f"corridor's duration and a second, got {longest:.0f} s{silences} (time in "
                 f"{self._units['time']})"
             )
@@ -401,7 +403,7 @@ class Recording:
             .join_asof(
                 self.windows, left_on="second", right_on="first", by="group", check_sortedness=False
             )
-            .filter(c("window").is_not_null(), since <= self.branches.corridor.duration)
+            .filter(c("window").is_not_null(), since <= self.branches.corridor.conditions.duration)
             .with_columns(since)
             .join(labels, "id", maintain_order="left")
         )

@@ -74,14 +74,14 @@ def write_report(
     Returns:
         What the report says, as plain JSON.
     """
-    demand: Any = corridor.demand
+    demand: Any = corridor.conditions.demand
     content = {
         "road": corridor.name,
-        "duration": corridor.duration,
+        "duration": corridor.conditions.duration,
         "seeds": {name: list(each) for name, each in seeds.items()},
         "demand": {"mainline": demand.mainline[0][1], "on_ramps": list(demand.on_ramps)},
-        "exit_shares": list(corridor.exit_shares),
-        "average_dwell": corridor.average_dwell,
+        "exit_shares": list(corridor.geometry.exit_shares),
+        "average_dwell": corridor.scales.average_dwell,
         "notes": list(notes),
         "files": [_file(recording) for recording in recordings],
         "windows": list(windows),
@@ -161,15 +161,19 @@ def _draw(path: Path, corridor: Corridor, recording: Recording, record: Record) 
     """Draw points, density and speed of the first window over space and time."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
-    n = corridor.n_mainline
-    lengths = np.array(corridor.segment_lengths[:n])
+    n = corridor.geometry.n_mainline
+    lengths = np.array(corridor.geometry.segment_lengths[:n])
     faces = np.concatenate([[0.0], np.cumsum(lengths)])
     times = np.arange(record.n_steps + 1) - 0.5
     counts = record.counts[:, :n]
     speed = np.where(counts > 0, record.speed_sums[:, :n] / np.maximum(counts, 1), np.nan)
     figure = Figure(figsize=(9.0, 9.0), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, sharey=True)
-    colours: dict[str, Any] = {"cmap": "RdYlGn", "vmin": 0.0, "vmax": corridor.largest_speed_limit}
+    colours: dict[str, Any] = {
+        "cmap": "RdYlGn",
+        "vmin": 0.0,
+        "vmax": corridor.geometry.largest_speed_limit,
+    }
     points = recording.points()
     shown = {} if points["speed"].null_count() else {"c": points["speed"], **colours}
     axes[0].scatter(points["time"], points["position"], s=0.5, rasterized=True, **shown)

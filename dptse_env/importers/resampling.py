@@ -336,11 +336,11 @@ def count_ends(
 ) -> Counter[str]:
     """Count where the pieces of trajectories begin and end: at an entry, or amid the road."""
     road = branches.corridor
-    n, first, n_on = road.n_mainline, road.n_segments, road.n_on_ramps
+    n, first, n_on = road.geometry.n_mainline, road.geometry.n_segments, road.geometry.n_on_ramps
     before = range(first + 2, first + 2 + n_on)
-    after = range(first + 2 + n_on, first + 2 + road.n_ramps)
-    entries = [0, first, *itertools.chain(*road.on_ramp_segments), *before]
-    exits = [n - 1, first + 1, *itertools.chain(*road.off_ramp_segments), *after]
+    after = range(first + 2 + n_on, first + 2 + road.geometry.n_ramps)
+    entries = [0, first, *itertools.chain(*road.geometry.on_ramp_segments), *before]
+    exits = [n - 1, first + 1, *itertools.chain(*road.geometry.off_ramp_segments), *after]
     first_time, last_time = (
         pl.col("group").replace_strict({g: c[i] for g, c in coverage.items()}) for i in (0, 1)
     )

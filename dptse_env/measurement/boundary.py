@@ -58,7 +58,9 @@ class TrueBoundary(BoundaryModel):
         """Prepare a table for all traffic seeds."""
         super().__init__(task, traffic, model)
         # np.empty takes address space, not memory, until traffic is loaded.
-        self._table = np.empty((len(traffic.seeds), task.corridor.duration + 1, model.n_inputs))
+        self._table = np.empty(
+            (len(traffic.seeds), task.corridor.conditions.duration + 1, model.n_inputs)
+        )
 
     @property
     def shared(self) -> tuple[FloatArray, ...]:
@@ -148,25 +150,25 @@ BOUNDARIES: dict[BoundaryInputs, type[TrueBoundary | NominalBoundary]] = {
 
 def nominal_flows(corridor: Corridor, times: npt.ArrayLike) -> FloatArray:
     """Return the flows [veh/h] at the published demand, (..., S), at times [s] of shape (...)."""
-    demand = corridor.published_demand
+    demand = corridor.conditions.published_demand
     flow = value_at(demand.mainline, times)
     entering = [value_at(steps, times) for steps in demand.ramp_profiles]
-    on = dict(zip(corridor.on_ramps, entering, strict=True))
+    on = dict(zip(corridor.geometry.on_ramps, entering, strict=True))
     shares: list[FloatArray] = (
-        [np.full_like(flow, share) for share in corridor.exit_shares]
+        [np.full_like(flow, share) for share in corridor.geometry.exit_shares]
         if demand.exit_shares is None
         else [value_at(steps, times) for steps in demand.exit_shares]
     )
-    off = dict(zip(corridor.off_ramps, shares, strict=True))
+    off = dict(zip(corridor.geometry.off_ramps, shares, strict=True))
     mainline, leaving = [], []
-    for segment in range(corridor.n_mainline):
+    for segment in range(corridor.geometry.n_mainline):
         if segment in off:
             leaving.append(off[segment] * flow)
             flow = flow - leaving[-1]
         flow = flow + on.get(segment, 0.0)
         mainline.append(flow)
     ramps = zip(
-        (*corridor.on_ramp_segments, *corridor.off_ramp_segments),
+        (*corridor.geometry.on_ramp_segments, *corridor.geometry.off_ramp_segments),
         (*entering, *leaving),
         strict=True,
     )
@@ -197,7 +199,7 @@ def nominal_inputs(corridor: Corridor, model: ARZModel) -> FloatArray:
     that reaches them. Incidents are not considered.
     """
     road, v_f = model.road, model.parameters.free_flow_speed
-    flows = nominal_flows(corridor, np.arange(corridor.duration + 1))
+    flows = nominal_flows(corridor, np.arange(corridor.conditions.duration + 1))
     inputs = np.empty((len(flows), model.n_inputs))
     inputs[:, road.entry_inputs] = flows[:, road.entries]  # no ramp lies ahead of the first segment
     inputs[:, road.entry_inputs + 1] = v_f

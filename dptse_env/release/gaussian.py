@@ -72,7 +72,7 @@ class GaussianRelease(ReleaseModel):
         self._account = ReleaseAccount(
             math.hypot(*self.mu), task.settings.delta, self.sensitivity[0].contributions
         )
-        shortest = min(task.corridor.segment_lengths)
+        shortest = min(task.corridor.geometry.segment_lengths)
         sigma = np.tile(self.noise_std[task.channels.group], (n, 1, 1))
         if task.releases_flow:
             self.unit, self.added_std = task.channels.length, sigma * shortest
@@ -217,11 +217,11 @@ class Paper(GaussianRelease):
         always = int(np.count_nonzero(task.channels.group[task.always] == group))
         return paper_sensitivity(
             n_sensors=(0 if group else task.queries.bandwidth) + always,
-            average_dwell=corridor.average_dwell,
-            segment_length=min(corridor.segment_lengths),
+            average_dwell=corridor.scales.average_dwell,
+            segment_length=min(corridor.geometry.segment_lengths),
             # Constants of the corridor, so that the noise does not depend on the estimator.
-            free_flow_speed=corridor.speed_scale,
-            jam_density=corridor.density_scale,
+            free_flow_speed=corridor.scales.speed_scale,
+            jam_density=corridor.scales.density_scale,
         )
 
     def _noise_std(self, group: int) -> tuple[float, ...]:
@@ -330,7 +330,7 @@ class Capped(GaussianRelease):
         return Terms(
             np.full(len(task.groups), math.inf if cap is None else float(cap)),
             clip=self.centre(task.corridor, task.settings),
-            fastest=np.float32(task.corridor.largest_speed_limit),
+            fastest=np.float32(task.corridor.geometry.largest_speed_limit),
         )
 
     def _sensitivity(self, group: int) -> Sensitivity:
@@ -338,8 +338,8 @@ class Capped(GaussianRelease):
         return contribution_sensitivity(
             contributions=settings.contributions(self.task.horizon),
             adjacency=settings.adjacency,
-            segment_length=min(corridor.segment_lengths),
-            largest_speed=corridor.largest_speed_limit,
+            segment_length=min(corridor.geometry.segment_lengths),
+            largest_speed=corridor.geometry.largest_speed_limit,
         )
 
     def _noise_std(self, group: int) -> tuple[float, ...]:

@@ -165,7 +165,7 @@ class ReleaseModel(ABC):
 
 def middle_speed(corridor: Corridor) -> float:
     """Return half of the largest speed limit [km/h]: speeds deviate alike to both sides."""
-    return 0.5 * corridor.largest_speed_limit
+    return 0.5 * corridor.geometry.largest_speed_limit
 
 
 def check_released(release: ReleaseModel, released: Any, request: Request) -> None:

@@ -127,7 +127,7 @@ class Paced(ReleaseModel):
             (1.0 - ROUNDING) * self.budget,
             ratio=settings.ratio,
             clip=settings.clip,
-            fastest=np.float32(task.corridor.largest_speed_limit),
+            fastest=np.float32(task.corridor.geometry.largest_speed_limit),
         )
         self.ledgers = Ledgers(task.channels, n, terms)
         pacing = EventPacing if settings.unit == "event" else TripPacing
@@ -148,9 +148,9 @@ class Paced(ReleaseModel):
         # No vehicle pays a price above its budget.
         least = 1.0 / math.sqrt(self.budget.max())
         require_exact_sums(np.array([least, self._flow_noise * least]), settings.clip)
-        self._limits = np.array(task.corridor.speed_limits)
-        n_boundaries = task.n_cells - task.corridor.n_segments
-        self._neighbours = np.array(task.corridor.boundary_neighbours)[:n_boundaries]
+        self._limits = np.array(task.corridor.geometry.speed_limits)
+        n_boundaries = task.n_cells - task.corridor.geometry.n_segments
+        self._neighbours = np.array(task.corridor.geometry.boundary_neighbours)[:n_boundaries]
         self._fallback = np.zeros(n)
         self._refused = np.zeros((n, len(task.groups)), dtype=np.int64)
 
@@ -158,10 +158,10 @@ class Paced(ReleaseModel):
     def _expected_std(self) -> FloatArray:
         """Deviations of the shortest segment's noise at the published demand, shape (groups, 2)."""
         corridor = self.task.corridor
-        prices = self.pacing.expected_prices(np.array(corridor.speed_limits))
+        prices = self.pacing.expected_prices(np.array(corridor.geometry.speed_limits))
         count = 1.0 / np.sqrt(prices)
         std: FloatArray = np.stack([count, self._flow_noise * count], axis=-1)
-        return std / min(corridor.segment_lengths)
+        return std / min(corridor.geometry.segment_lengths)
 
     @property
     def sigma(self) -> FloatArray:
@@ -200,7 +200,7 @@ class Paced(ReleaseModel):
         fallback = np.empty(len(centre))
         _centre(
             prediction.density, prediction.speed, self._limits, self._neighbours,
-            task.corridor.largest_speed_limit, predicted, centre, fallback,
+            task.corridor.geometry.largest_speed_limit, predicted, centre, fallback,
         )  # fmt: skip
         self._fallback[request.episodes] = fallback
         return predicted, centre

@@ -76,7 +76,7 @@ class Pacing(ABC):
 
         Shape (k, n_mainline), in [0, 1].
         """
-        return np.zeros((len(episodes), self.task.corridor.n_mainline))
+        return np.zeros((len(episodes), self.task.corridor.geometry.n_mainline))
 
 
 class Paces(NamedTuple):
@@ -108,7 +108,7 @@ class TripPacing(Pacing):
         super().__init__(task, budget)
         self._first_rates = np.zeros((len(task.groups), task.n_cells))
         self._first_rates[task.channels.group[task.always], task.channels.first[task.always]] = 1.0
-        mainline = self._first_rates[0, : task.corridor.n_mainline]
+        mainline = self._first_rates[0, : task.corridor.geometry.n_mainline]
         mainline[:] = np.maximum(mainline, _coverage(task.queries))
         self._paces = Paces(
             offered=task.settings.pace * budget,
@@ -143,7 +143,7 @@ class TripPacing(Pacing):
 
     def spent_share(self, episodes: IntArray) -> FloatArray:
         """See `Pacing.spent_share`."""
-        spent = self._paces.spent.take(episodes, 0)[:, 0, : self.task.corridor.n_mainline]
+        spent = self._paces.spent.take(episodes, 0)[:, 0, : self.task.queries.n_mainline]
         part: FloatArray = np.minimum(spent / self.budget[0], 1.0)
         return part
 

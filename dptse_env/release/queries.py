@@ -122,7 +122,7 @@ class QueryOptions:
         n = self.n_mainline
         shared = {} if self.separate_sensors else self._singles
         sensors = [s for s in corridor.fixed_sensors if s < n and s not in shared]
-        return [*range(n, corridor.n_segments), *sensors]
+        return [*range(n, corridor.geometry.n_segments), *sensors]
 
     @cached_property
     def _singles(self) -> dict[int, int]:

@@ -126,7 +126,7 @@ class Task:
     def covered(self, observed: BoolArray) -> BoolArray:
         """Return the mainline segments (k, n_mainline) of observed channels (k, C)."""
         if self.queries.are_segments and self.n_on_road == self.corridor.road.n_segments:
-            return observed[:, : self.corridor.n_mainline]
+            return observed[:, : self.corridor.geometry.n_mainline]
         on_road = observed[:, : self.n_on_road].astype(np.float32)
         segments: BoolArray = on_road @ self._covers_mainline > 0.0
         return segments
@@ -139,7 +139,7 @@ class Task:
     @cached_property
     def _covers_mainline(self) -> NDArray[np.float32]:
         """Shape (M, n_mainline), as numbers: products of floats are faster."""
-        return self.covers[: self.n_on_road, : self.corridor.n_mainline].astype(np.float32)
+        return self.covers[: self.n_on_road, : self.corridor.geometry.n_mainline].astype(np.float32)
 
     # Groups -------------------------------------------------------------------------------------
 

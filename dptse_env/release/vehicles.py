@@ -80,12 +80,14 @@ class Traffic:
         """Prepare tables; nothing is loaded or recorded yet."""
         self.corridor, self.seeds, self.library = corridor, seeds, library
         self.populations = tuple(populations)
-        columns = corridor.n_segments + corridor.n_boundaries
+        columns = corridor.geometry.n_segments + corridor.geometry.n_boundaries
         # np.empty takes address space, not memory, until a record is written.
-        self._table = np.empty((len(seeds), corridor.duration + 1, columns, 2))
+        self._table = np.empty((len(seeds), corridor.conditions.duration + 1, columns, 2))
         self._loaded = np.zeros(len(seeds), dtype=bool)
         self.n_vehicles: IntArray = np.zeros(len(seeds), dtype=np.int64)
-        self._start: IntArray = np.zeros((len(seeds), corridor.duration + 2), dtype=np.int64)
+        self._start: IntArray = np.zeros(
+            (len(seeds), corridor.conditions.duration + 2), dtype=np.int64
+        )
         self._vehicle: NDArray[np.int32] = np.empty(0, dtype=np.int32)
         self._place: NDArray[np.int16] = np.empty(0, dtype=np.int16)
         self._speed: NDArray[np.float32] = np.empty((len(self.populations), 0), dtype=np.float32)

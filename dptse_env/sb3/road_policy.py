@@ -110,7 +110,7 @@ class RoadChannels:
                 "a policy whose network is shared by all segments needs query_spans (1,), got "
                 f"{config.queries}"
             )
-        corridor, n = config.corridor, config.corridor.n_mainline
+        corridor, n = config.corridor, config.corridor.geometry.n_mainline
         encoding = make_interface(config).observations
         starts = {name: place.start for name, place in encoding.slices.items()}
         released = [name for name in starts if name.startswith("released_")]

@@ -209,10 +209,10 @@ def load_policy(
 
 def describe_road(corridor: Corridor) -> str:
     """Return the name and the sizes of a corridor in words."""
-    length = min(corridor.segment_lengths[: corridor.n_mainline])
+    length = min(corridor.geometry.segment_lengths[: corridor.geometry.n_mainline])
     return (
-        f"{corridor.name} ({corridor.n_mainline} mainline segments of {length:g} km, "
-        f"{corridor.most_lanes} lanes, fixed sensors on {list(corridor.fixed_sensors)})"
+        f"{corridor.name} ({corridor.geometry.n_mainline} mainline segments of {length:g} km, "
+        f"{corridor.geometry.most_lanes} lanes, fixed sensors on {list(corridor.fixed_sensors)})"
     )
 
 

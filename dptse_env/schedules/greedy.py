@@ -119,7 +119,7 @@ class GreedyTrace(ProcessSchedule):
             is_walk=config.estimator == "random_walk",
             is_box=settings.bounds == "box",
             lengths=model.road.lengths[:n],
-            scales=np.array([corridor.density_scale, corridor.speed_scale]),
+            scales=np.array([corridor.scales.density_scale, corridor.scales.speed_scale]),
             speed_unit=float(model.speed_scale),
             term_weights=np.array([term != "speed", term != "density"], dtype=np.float64),
             speed_cap=self.speed_cap,

@@ -29,9 +29,11 @@ class OracleError(ProcessSchedule):
         truth, estimate = process.truth(episodes)[:, :n], process.estimate.at(episodes)
         error = np.zeros((len(episodes), n))
         if term != "speed":
-            error += ((estimate.density[:, :n] - truth[..., 0]) / corridor.density_scale) ** 2
+            error += (
+                (estimate.density[:, :n] - truth[..., 0]) / corridor.scales.density_scale
+            ) ** 2
         if term != "density":
-            speed = ((estimate.speed[:, :n] - truth[..., 1]) / corridor.speed_scale) ** 2
+            speed = ((estimate.speed[:, :n] - truth[..., 1]) / corridor.scales.speed_scale) ** 2
             error += np.where(truth[..., 0] > 0.0, speed, 0.0)
         return self.highest(error, step)
 

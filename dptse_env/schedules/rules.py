@@ -293,8 +293,8 @@ class ExpectedReduction(ProcessSchedule):
         super().__init__(process, seed)
         self._noise = np.square(process.expected_sigma)
         corridor, term = process.config.corridor, process.interface.reward.term
-        self._of_density = (term != "speed") / corridor.density_scale**2
-        self._of_speed = (term != "density") / corridor.speed_scale**2
+        self._of_density = (term != "speed") / corridor.scales.density_scale**2
+        self._of_speed = (term != "density") / corridor.scales.speed_scale**2
 
     def _choose(self, episodes: IntArray, step: IntArray, observation: Observation) -> BoolArray:
         n, estimate = self.n_mainline, self.process.estimate

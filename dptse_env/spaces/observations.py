@@ -122,11 +122,11 @@ _TINY = np.finfo(np.float64).tiny
 
 
 def _segments(task: Task) -> int:
-    return task.corridor.n_segments
+    return task.corridor.geometry.n_segments
 
 
 def _mainline(task: Task) -> int:
-    return task.corridor.n_mainline
+    return task.corridor.geometry.n_mainline
 
 
 def _options(task: Task) -> int:
@@ -138,15 +138,15 @@ def _fixed(task: Task) -> int:
 
 
 def _density_scale(task: Task) -> float:
-    return task.corridor.density_scale
+    return task.corridor.scales.density_scale
 
 
 def _speed_scale(task: Task) -> float:
-    return task.corridor.speed_scale
+    return task.corridor.scales.speed_scale
 
 
 def _flow_scale(task: Task) -> float:
-    return task.corridor.density_scale * task.corridor.speed_scale
+    return task.corridor.scales.density_scale * task.corridor.scales.speed_scale
 
 
 def _of_options(component: int) -> Callable[[Task], Any]:
@@ -183,7 +183,7 @@ SHIPPED_BLOCKS = (
     Block("queried", _options, 0, 1, "queried"),
     Block("fixed_density_innovation", _fixed, -10, 10, "innovations", part=_of_sensors(0)),
     Block("fixed_speed_innovation", _fixed, -10, 10, "innovations", part=_of_sensors(1)),
-    Block("bandwidth", lambda _: 1, 0, 1, "", lambda task: task.corridor.n_mainline,
+    Block("bandwidth", lambda _: 1, 0, 1, "", lambda task: task.corridor.geometry.n_mainline,
           constant=lambda task: task.queries.bandwidth),
     Block("epsilon", lambda _: 1, -6, 6, "",
           constant=lambda task: float(np.log10(task.settings.epsilon))),

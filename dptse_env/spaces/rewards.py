@@ -92,12 +92,12 @@ class ErrorReward:
         """Return the rewards of k episodes, shape (k,)."""
         error, corridor = second.error, second.corridor
         if self.term == "density":
-            return -error.density / corridor.density_scale
+            return -error.density / corridor.scales.density_scale
         if self.term == "speed":
-            return -error.speed / corridor.speed_scale
-        density = error.density / corridor.density_scale
-        speed = error.speed / corridor.speed_scale
-        n, m = corridor.n_mainline, error.n_occupied
+            return -error.speed / corridor.scales.speed_scale
+        density = error.density / corridor.scales.density_scale
+        speed = error.speed / corridor.scales.speed_scale
+        n, m = corridor.geometry.n_mainline, error.n_occupied
         return -np.sqrt((n * density**2 + m * speed**2) / (n + m))
 
 

@@ -3,7 +3,7 @@
 Importing this package does not import libsumo; only making a record does.
 """
 
-from dptse_env.traffic.corridor import Corridor, Recordings
+from dptse_env.traffic.corridor import Conditions, Corridor, Recordings, Scales, Source
 from dptse_env.traffic.demand import (
     Demand,
     DemandDistribution,
@@ -12,6 +12,7 @@ from dptse_env.traffic.demand import (
     IncidentDistribution,
     VehicleClass,
 )
+from dptse_env.traffic.geometry import Geometry
 from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
 from dptse_env.traffic.own_sumo import SumoScenario
@@ -39,10 +40,12 @@ __all__ = [
     "MOST_VEHICLES",
     "PAPER_HIGHWAY",
     "SHORT_HIGHWAY",
+    "Conditions",
     "Corridor",
     "Demand",
     "DemandDistribution",
     "Drivers",
+    "Geometry",
     "Incident",
     "IncidentDistribution",
     "InvalidRecordError",
@@ -54,7 +57,9 @@ __all__ = [
     "Recordings",
     "Records",
     "RoadFile",
+    "Scales",
     "Scenario",
+    "Source",
     "SumoScenario",
     "SumoVersionError",
     "VehicleClass",

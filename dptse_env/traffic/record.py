@@ -302,15 +302,15 @@ def average_dwell(corridor: Corridor, records: Iterable[Record]) -> float:
         more_present, more_passages = _dwell(record, corridor)
         present, passages = present + more_present, passages + more_passages
     brings = f"one that brings vehicles to the mainline of {corridor.name!r}"
-    require(passages > 0.0, "corridor.demand", brings, corridor.demand)
+    require(passages > 0.0, "corridor.demand", brings, corridor.conditions.demand)
     return present / passages
 
 
 def _dwell(record: Record, corridor: Corridor) -> tuple[float, float]:
     """Return the time of vehicles on mainline segments [s] in a record, and their passages."""
-    n = corridor.n_mainline
+    n = corridor.geometry.n_mainline
     if record.field is not None:
-        vehicles = record.field[:, :n, 0] * np.array(corridor.segment_lengths[:n])
+        vehicles = record.field[:, :n, 0] * np.array(corridor.geometry.segment_lengths[:n])
         passing = record.field[:, :n].prod(axis=-1)
         return float(vehicles.sum()), float(passing.sum()) / HOUR
     mainline = record.segment < n

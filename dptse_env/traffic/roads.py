@@ -3,15 +3,15 @@
 The corridors that come with the package have an `average_dwell` measured on the training seeds
 0..15, by ``dptse record --env ID --seeds 0:16``; a test repeats the measurement.
 
-A road file is a corridor, and the keywords of an environment that suit it. It has the fields of
-`Corridor`, with tables for ``demand``, ``incident``, ``drivers`` and ``recordings``, whose folder
-may be relative to the file, and a table ``environment`` of keywords of ``gym.make`` that hold on
-this road unless the caller gives them. ``docs/guides/your-road.md`` has the format and an example.
+A road file is a corridor, and the keywords of an environment that suit it. It has the fields of a
+`Corridor` and of its parts, with tables for ``demand``, ``incident``, ``drivers`` and
+``recordings``, whose folder may be relative to the file, and a table ``environment`` of keywords of
+``gym.make`` that hold on this road unless the caller gives them. ``docs/guides/your-road.md`` has
+the format and an example.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 from collections.abc import Mapping
@@ -21,30 +21,16 @@ from typing import Any, TypeGuard
 
 import tomli_w
 
-from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.corridor import Conditions, Corridor, Scales
 from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, IncidentDistribution
-from dptse_env.utils.fields import from_mapping, read_toml, require, within
+from dptse_env.traffic.geometry import Geometry
+from dptse_env.utils.fields import read_toml, require, within
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.registry import Registry, require_registered
-from dptse_env.utils.units import HOUR
 
 SUFFIX = ".toml"
 """Ending of the name of a road file."""
 
-ASSUMED_PACE = 3.0
-"""Assumed ratio of the average dwell to the time of a crossing at the speed limit, where a file
-does not give the dwell. Records of the shipped roads, with their jams, have 2.8 to 2.9."""
-
-DENSITY_SCALE = 111.0
-"""Scale of densities for each lane [veh/km], which the shipped roads have, too."""
-
-_OPTIONAL: dict[str, Any] = {
-    "on_ramps": (),
-    "off_ramps": (),
-    "exit_shares": (),
-    "incident": None,
-    "fixed_sensors": (),
-}
 _ENVIRONMENT = "environment"
 PARTS = ("action", "estimator", "observation", "privacy", "reward")
 """Keywords that take names of parts. In a file these are registered names: ``"module:Name"`` would
@@ -53,60 +39,59 @@ _WITH_FOLDER = ("recordings", "network")
 _FILE_ENDINGS = (".json", ".safetensors")
 
 
+_PAPER = Geometry(15, on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
 PAPER_HIGHWAY = Corridor(
     name="paper-highway",
-    n_mainline=15,
-    on_ramps=(3, 9),
-    off_ramps=(6, 12),
-    exit_shares=(0.1, 0.1),
-    demand=Demand(
-        mainline=((0.0, 2050.0), (200.0, 6050.0), (400.0, 2050.0)), on_ramps=(320.0, 300.0)
+    geometry=_PAPER,
+    conditions=Conditions(
+        demand=Demand(
+            mainline=((0.0, 2050.0), (200.0, 6050.0), (400.0, 2050.0)), on_ramps=(320.0, 300.0)
+        ),
+        incident=Incident(segment=10, phases=((200.0, 400.0, 10.08), (400.0, 500.0, 50.95))),
+        duration=700,
     ),
-    incident=Incident(segment=10, phases=((200.0, 400.0, 10.08), (400.0, 500.0, 50.95))),
+    scales=Scales.of(_PAPER, average_dwell=10.25),
     fixed_sensors=(14, 17, 18),
-    duration=700,
-    average_dwell=10.25,
 )
 """The paper's 1.5 km stretch (section IV), its demand and its incident on segment 11.
 
 The paper does not state the three lanes, the exit shares of 10 % and the end after 700 s.
 """
 
+_SHORT = Geometry(6, on_ramps=(2,), off_ramps=(4,), exit_shares=(0.1,), lanes=2)
 SHORT_HIGHWAY = Corridor(
     name="short-highway",
-    n_mainline=6,
-    on_ramps=(2,),
-    off_ramps=(4,),
-    exit_shares=(0.1,),
-    demand=Demand(mainline=((0.0, 1800.0), (60.0, 3000.0), (150.0, 1500.0)), on_ramps=(300.0,)),
-    incident=Incident(segment=4, phases=((60.0, 140.0, 12.0), (140.0, 170.0, 50.0))),
+    geometry=_SHORT,
+    conditions=Conditions(
+        demand=Demand(mainline=((0.0, 1800.0), (60.0, 3000.0), (150.0, 1500.0)), on_ramps=(300.0,)),
+        incident=Incident(segment=4, phases=((60.0, 140.0, 12.0), (140.0, 170.0, 50.0))),
+        duration=240,
+    ),
+    scales=Scales.of(_SHORT, average_dwell=9.95),
     fixed_sensors=(5, 7),
-    duration=240,
-    lanes=2,
-    density_scale=222.0,
-    average_dwell=9.95,
 )
 """A 0.6 km stretch with one ramp of each kind and a jam, for tests and first trials."""
 
+_LONG = Geometry(
+    120, on_ramps=(24, 52, 80, 108), off_ramps=(20, 48, 76, 104), exit_shares=(0.1,) * 4
+)
 LONG_HIGHWAY = Corridor(
     name="long-highway",
-    n_mainline=120,
-    on_ramps=(24, 52, 80, 108),
-    off_ramps=(20, 48, 76, 104),
-    exit_shares=(0.1, 0.1, 0.1, 0.1),
-    demand=DemandDistribution(
-        Demand(
-            mainline=((0.0, 3000.0), (300.0, 5000.0), (750.0, 3000.0)),
-            on_ramps=(400.0, 400.0, 400.0, 400.0),
-        )
+    geometry=_LONG,
+    conditions=Conditions(
+        demand=DemandDistribution(
+            Demand(
+                mainline=((0.0, 3000.0), (300.0, 5000.0), (750.0, 3000.0)), on_ramps=(400.0,) * 4
+            )
+        ),
+        incident=(
+            IncidentDistribution(tuple(range(10, 60)), start=(300.0, 700.0)),
+            IncidentDistribution(tuple(range(60, 119)), start=(400.0, 800.0)),
+        ),
+        duration=1200,
     ),
-    incident=(
-        IncidentDistribution(tuple(range(10, 60)), start=(300.0, 700.0)),
-        IncidentDistribution(tuple(range(60, 119)), start=(400.0, 800.0)),
-    ),
+    scales=Scales.of(_LONG, average_dwell=4.52),
     fixed_sensors=(119, 124, 125, 126, 127),
-    duration=1200,
-    average_dwell=4.52,
 )
 """A 12 km stretch with four interchanges; demand level and two incidents vary with the seed."""
 
@@ -131,14 +116,14 @@ def randomised(corridor: Corridor) -> Corridor:
     the record's duration. The demand of `corridor` is the base of the distribution; its incident is
     dropped. Other fields are unchanged, also `average_dwell`, which should be measured again.
     """
-    base, total = corridor.published_demand, corridor.duration
+    base, total = corridor.conditions.published_demand, corridor.conditions.duration
     incident = IncidentDistribution(
-        segments=tuple(range(corridor.n_mainline - 1)),
+        segments=tuple(range(corridor.geometry.n_mainline - 1)),
         start=(0.1 * total, 0.65 * total),
         duration=(0.1 * total, 0.4 * total),
         recovery_duration=(0.05 * total, 0.2 * total),
     )
-    return dataclasses.replace(corridor, demand=DemandDistribution(base), incident=incident)
+    return corridor.replaced(demand=DemandDistribution(base), incident=incident)
 
 
 @dataclass(frozen=True)
@@ -165,9 +150,8 @@ def is_road_file(value: object) -> TypeGuard[str | os.PathLike[str]]:
 def read_road(path: str | os.PathLike[str]) -> RoadFile:
     """Read a road file.
 
-    Fields that may be left out: ``name`` is then the file's, there are no ramps, incidents or fixed
-    sensors, and the scales follow lanes and speed limit. The average dwell is then assumed to be
-    `ASSUMED_PACE` times the time of a crossing at the speed limit, and named in ``assumed``.
+    Without ``name``, it is that of the file. Scales that are left out follow lanes and speed limit
+    (`Scales.of`); an average dwell that is assumed so is named in ``assumed``.
 
     Raises:
         ValueError: There is no such file, it is no TOML, a field is unknown, missing or out of
@@ -181,7 +165,7 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
         require(isinstance(environment, Mapping), _ENVIRONMENT, "a table", environment)
         own = environment.get("corridor")
         require(own is None, f"{_ENVIRONMENT}.corridor", "left out: this file is one", own)
-        corridor, assumed = _corridor(content, path)
+        corridor = _corridor(content, path)
         try:
             for key in PARTS:
                 require_registered(environment.get(key), f"{_ENVIRONMENT}.{key}")
@@ -189,6 +173,7 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
             keywords = {key: _absolute(value, home) for key, value in environment.items()}
         except RecursionError as problem:
             raise ValueError(f"{_ENVIRONMENT} must not be nested so deeply") from problem
+    assumed = () if "average_dwell" in content else ("average_dwell",)
     return RoadFile(corridor, keywords, assumed)
 
 
@@ -211,11 +196,10 @@ def write_corridor(
         environment: Keywords of an environment for the table ``environment``.
         comment: Text for the head of the file.
     """
-    content = _plain(dataclasses.asdict(corridor))
+    content = _plain(corridor.fields())
     for name in _WITH_FOLDER:
-        given = getattr(corridor, name)
-        if given is not None:
-            content[name]["folder"] = from_home(path, given.folder)
+        if name in content:
+            content[name]["folder"] = from_home(path, content[name]["folder"])
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())
@@ -232,9 +216,9 @@ def from_home(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> str
     return Path(os.path.relpath(target, home)).as_posix() if same_drive else target.as_posix()
 
 
-def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[str, ...]]:
-    """Return the corridor of a file's fields, and the names of those that were assumed."""
-    fields = {**_OPTIONAL, **content}
+def _corridor(content: Mapping[str, Any], path: Path) -> Corridor:
+    """Return the corridor of a file's fields."""
+    fields = dict(content)
     for name in _WITH_FOLDER:
         given = fields.get(name)
         if isinstance(given, Mapping) and isinstance(given.get("folder"), str):
@@ -242,20 +226,7 @@ def _corridor(content: Mapping[str, Any], path: Path) -> tuple[Corridor, tuple[s
             fields[name] = {**given, "folder": folder}
     if "name" not in fields:
         fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")
-    corridor = from_mapping(Corridor, fields, "corridor")
-    n = corridor.n_mainline
-    crossings = [
-        HOUR * length / limit
-        for length, limit in zip(corridor.segment_lengths, corridor.speed_limits, strict=True)
-    ]
-    derived = {
-        "density_scale": DENSITY_SCALE * corridor.most_lanes,
-        "speed_scale": corridor.largest_speed_limit,
-        "average_dwell": ASSUMED_PACE * sum(crossings[:n]) / n,
-    }
-    fields |= {name: value for name, value in derived.items() if name not in content}
-    assumed = () if "average_dwell" in content else ("average_dwell",)
-    return from_mapping(Corridor, fields, "corridor"), assumed
+    return Corridor.from_fields(fields)
 
 
 def _absolute(value: Any, folder: Path) -> Any:

@@ -72,17 +72,17 @@ def draw_scenario(corridor: Corridor, seed: int) -> Scenario:
     demand_seed, incident_seed, arrival_seed, sumo_seed, class_seed = np.random.SeedSequence(
         seed
     ).spawn(5)
-    demand, scale = corridor.demand, 1.0
+    demand, scale = corridor.conditions.demand, 1.0
     if isinstance(demand, DemandDistribution):
         scale = demand.draw_scale(np.random.default_rng(demand_seed))
         demand = demand.base.scaled(scale)
     generator = np.random.default_rng(incident_seed)
     incidents = tuple(
         each.draw(generator) if isinstance(each, IncidentDistribution) else each
-        for each in corridor.incidents
+        for each in corridor.conditions.incidents
     )
     generator = np.random.default_rng(arrival_seed)
-    duration = corridor.duration if corridor.network is None else 0
+    duration = corridor.conditions.duration if corridor.source.network is None else 0
     departures, origins = _arrivals(demand, duration, generator)
     return Scenario(
         seed=seed,
@@ -125,10 +125,12 @@ def _exits(
     generator: np.random.Generator,
 ) -> NDArray[np.int64]:
     """Let each vehicle choose at each diverge that it passes, until it has left."""
-    entry_face = np.array([*corridor.on_ramps, 0], dtype=np.int64)[origins]
+    entry_face = np.array([*corridor.geometry.on_ramps, 0], dtype=np.int64)[origins]
     exits = np.full(len(origins), MAINLINE, dtype=np.int64)
-    profiles = demand.exit_shares or tuple(((0.0, share),) for share in corridor.exit_shares)
-    for ramp, (face, profile) in enumerate(zip(corridor.off_ramps, profiles, strict=True)):
+    profiles = demand.exit_shares or tuple(
+        ((0.0, share),) for share in corridor.geometry.exit_shares
+    )
+    for ramp, (face, profile) in enumerate(zip(corridor.geometry.off_ramps, profiles, strict=True)):
         leaves = generator.random(len(origins)) < value_at(profile, departures)
         exits[leaves & (exits == MAINLINE) & (entry_face < face)] = ramp
     return exits
@@ -138,7 +140,7 @@ def _classes(
     corridor: Corridor, n_vehicles: int, generator: np.random.Generator
 ) -> NDArray[np.int64]:
     """Draw the class of each vehicle."""
-    shares = [each.share for each in corridor.vehicle_classes] or [1.0]
+    shares = [each.share for each in corridor.conditions.vehicle_classes] or [1.0]
     bounds = np.cumsum(shares)[:-1]
     classes: NDArray[np.int64] = np.searchsorted(bounds, generator.random(n_vehicles), side="right")
     return classes

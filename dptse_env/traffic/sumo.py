@@ -111,10 +111,10 @@ def simulate(corridor: Corridor, seed: int, remark: Remark = lambda text: None) 
     """
     scenario = draw_scenario(corridor, seed)
     with running(corridor, scenario, remark) as libsumo:
-        if corridor.network is None:
+        if corridor.source.network is None:
             return _observe(libsumo, corridor, scenario)
         clock = seconds(libsumo, corridor, scenario)
-        rows = own_sumo.observe(libsumo, corridor.network, scenario.incidents, clock)
+        rows = own_sumo.observe(libsumo, corridor.source.network, scenario.incidents, clock)
     table = np.array(rows, dtype=np.float64).reshape(len(rows), 4).T
     step, vehicle, segment, speed = table[:, np.lexsort((table[2], table[0]))]
     return Record(
@@ -136,10 +136,10 @@ def running(
     Yields:
         The module libsumo; `seconds` advances its simulation.
     """
-    if corridor.recordings is not None:
+    if corridor.source.recordings is not None:
         cause = "its traffic is recorded, not simulated"
         raise RecordingError.from_cause(corridor, scenario.seed, cause)
-    network = network_xml(corridor) if corridor.network is None else ""
+    network = network_xml(corridor.geometry) if corridor.source.network is None else ""
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
         libsumo = _import_libsumo()
         if libsumo.isLoaded():
@@ -155,7 +155,7 @@ def running(
                 try:
                     libsumo.start(command)
                     yield libsumo
-                    if corridor.network is not None:
+                    if corridor.source.network is not None:
                         own_sumo.tell_departures(libsumo, remark)
                 finally:
                     if libsumo.isLoaded():
@@ -175,15 +175,15 @@ def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iter
     Yields:
         0, 1, ..., `corridor.duration`: the second [s] whose state libsumo holds.
     """
-    network, substeps, changes = corridor.network, SUBSTEPS, list[tuple[float, int, float]]()
+    network, substeps, changes = corridor.source.network, SUBSTEPS, list[tuple[float, int, float]]()
     if network is None:
-        changes = limit_changes(scenario.incidents, corridor.speed_limits)
+        changes = limit_changes(scenario.incidents, corridor.geometry.speed_limits)
     else:
         substeps = network.substeps
         for _ in range(network.warm_up * substeps):
             libsumo.simulationStep()
     yield 0
-    for second in range(corridor.duration):
+    for second in range(corridor.conditions.duration):
         for substep in range(substeps):
             while changes and changes[0][0] <= second + substep * STEP_LENGTH:
                 _, segment, limit = changes.pop(0)
@@ -262,8 +262,8 @@ def _stderr_to(path: Path) -> Iterator[None]:
 
 def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario) -> list[str]:
     """Write SUMO's input files and return its command line."""
-    if corridor.network is not None:
-        return own_sumo.command(folder, corridor.network, scenario.sumo_seed, scenario.scale)
+    if corridor.source.network is not None:
+        return own_sumo.command(folder, corridor.source.network, scenario.sumo_seed, scenario.scale)
     network_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
     network_file.write_text(network, encoding="utf-8")
     route_file.write_text(routes_xml(corridor, scenario), encoding="utf-8")
@@ -273,7 +273,7 @@ def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario)
 
 def _observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Record:
     """Run the loaded simulation to its end and collect the vehicle table."""
-    edges = edge_ids(corridor)
+    edges = edge_ids(corridor.geometry)
     vehicles_on, speed_of = libsumo.edge.getLastStepVehicleIDs, libsumo.vehicle.getSpeed
     n_on: list[int] = []
     names: list[str] = []
@@ -292,6 +292,6 @@ def _observe(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Rec
         vehicle=np.fromstring(" ".join(names), dtype=np.int32, sep=" "),
         segment=(cells % len(edges)).astype(np.int16),
         speed=(KMH * np.array(speed, dtype=np.float64)).astype(np.float32),
-        n_steps=corridor.duration + 1,
+        n_steps=corridor.conditions.duration + 1,
         n_columns=len(edges),
     )

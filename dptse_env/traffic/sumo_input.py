@@ -2,7 +2,7 @@
 
 The networks of the package's corridors come with it; any other geometry is compiled by netconvert
 on demand, which needs `eclipse-sumo` (extra ``corridors``). ``networks/NAME.net.xml`` is
-``compile_network(Geometry.from_corridor(CORRIDORS[NAME]))``.
+``compile_network(CORRIDORS[NAME].geometry)``.
 
 Every edge declares the nominal length of its segment, and the recording runs with SUMO's internal
 links switched off: every vehicle is then on exactly one segment.
@@ -19,9 +19,9 @@ from collections.abc import Sequence
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
 
 from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.geometry import Geometry
 from dptse_env.traffic.roads import SHIPPED_CORRIDORS
 from dptse_env.traffic.scenario import MAINLINE, Scenario
 from dptse_env.utils.registry import missing_extra
@@ -48,29 +48,11 @@ class NetworkError(RuntimeError):
     """A network cannot be compiled: netconvert refused it."""
 
 
-class Geometry(NamedTuple):
-    """The part of a corridor that its network depends on."""
-
-    n_mainline: int
-    on_ramps: tuple[int, ...]
-    off_ramps: tuple[int, ...]
-    on_ramp_segments: tuple[tuple[int, ...], ...]
-    off_ramp_segments: tuple[tuple[int, ...], ...]
-    segment_lengths: tuple[float, ...]
-    segment_lanes: tuple[int, ...]
-    speed_limits: tuple[float, ...]
-
-    @classmethod
-    def from_corridor(cls, corridor: Corridor) -> "Geometry":
-        """Return the geometry of a corridor."""
-        return cls(*(getattr(corridor, field) for field in cls._fields))
-
-
-def edge_ids(corridor: Corridor) -> tuple[str, ...]:
+def edge_ids(geometry: Geometry) -> tuple[str, ...]:
     """Return the SUMO edge of each record column: the S segments, then the R boundary segments."""
-    on_ramps, off_ramps = corridor.on_ramp_segments, corridor.off_ramp_segments
+    on_ramps, off_ramps = geometry.on_ramp_segments, geometry.off_ramp_segments
     return (
-        *(f"main_{i}" for i in range(corridor.n_mainline)),
+        *(f"main_{i}" for i in range(geometry.n_mainline)),
         *(edge for i, ramp in enumerate(on_ramps) for edge in ramp_edges(f"on_{i}", ramp)),
         *(edge for i, ramp in enumerate(off_ramps) for edge in ramp_edges(f"off_{i}", ramp)),
         "upstream",
@@ -86,16 +68,16 @@ def ramp_edges(name: str, segments: Sequence[int]) -> tuple[str, ...]:
     return tuple(f"{name}_{k}" for k in range(len(segments))) if several else (name,)
 
 
-def network_xml(corridor: Corridor) -> str:
-    """Return the corridor's compiled network: the packaged one, else a fresh compilation.
+def network_xml(geometry: Geometry) -> str:
+    """Return the compiled network of a road: the packaged one, else a fresh compilation.
 
     Raises:
         MissingExtraError: The geometry is not that of a preset, and netconvert is missing.
         NetworkError: netconvert fails.
     """
-    geometry = Geometry.from_corridor(corridor)
+    described = _plain_xml(geometry)
     for preset in SHIPPED_CORRIDORS:
-        if Geometry.from_corridor(preset) == geometry:
+        if _plain_xml(preset.geometry) == described:
             return packaged_network(preset.name)
     return compile_network(geometry)
 
@@ -246,19 +228,21 @@ class _PlainXML:
 
 def routes_xml(corridor: Corridor, scenario: Scenario) -> str:
     """Return SUMO's route file of a scenario, on the network that is made for its corridor."""
-    classes = {each.name: each.attributes(corridor.drivers) for each in corridor.vehicle_classes}
-    classes = classes or {"car": corridor.drivers.attributes()}
+    road, drivers = corridor.geometry, corridor.conditions.drivers
+    classes = {
+        each.name: each.attributes(drivers) for each in corridor.conditions.vehicle_classes
+    } or {"car": drivers.attributes()}
     lines = []
     for name, attributes in classes.items():
         values = " ".join(f'{key}="{value}"' for key, value in attributes.items())
         lines.append(f'<vType id="{name}" {values}/>')
-    for origin in range(MAINLINE, corridor.n_on_ramps):
-        for end in range(MAINLINE, corridor.n_off_ramps):
-            first = 0 if origin == MAINLINE else corridor.on_ramps[origin]
-            last = corridor.n_mainline if end == MAINLINE else corridor.off_ramps[end]
+    for origin in range(MAINLINE, road.n_on_ramps):
+        for end in range(MAINLINE, road.n_off_ramps):
+            first = 0 if origin == MAINLINE else road.on_ramps[origin]
+            last = road.n_mainline if end == MAINLINE else road.off_ramps[end]
             if first >= last:
                 continue
-            entry, leave = _entry_edges(corridor, origin), _exit_edges(corridor, end)
+            entry, leave = _entry_edges(road, origin), _exit_edges(road, end)
             edges = " ".join([*entry, *(f"main_{i}" for i in range(first, last)), *leave])
             lines.append(f'<route id="{origin}:{end}" edges="{edges}"/>')
     # As fast as is safe, on the lane that suits the route, and by default at the start of the
@@ -275,15 +259,15 @@ def routes_xml(corridor: Corridor, scenario: Scenario) -> str:
     return f"<routes>{''.join(lines)}</routes>"
 
 
-def _entry_edges(corridor: Corridor, origin: int) -> list[str]:
+def _entry_edges(geometry: Geometry, origin: int) -> list[str]:
     if origin == MAINLINE:
         return ["upstream"]
     name = f"on_{origin}"
-    return [f"before_{name}", *ramp_edges(name, corridor.on_ramp_segments[origin])]
+    return [f"before_{name}", *ramp_edges(name, geometry.on_ramp_segments[origin])]
 
 
-def _exit_edges(corridor: Corridor, end: int) -> list[str]:
+def _exit_edges(geometry: Geometry, end: int) -> list[str]:
     if end == MAINLINE:
         return ["downstream"]
     name = f"off_{end}"
-    return [*ramp_edges(name, corridor.off_ramp_segments[end]), f"after_{name}"]
+    return [*ramp_edges(name, geometry.off_ramp_segments[end]), f"after_{name}"]

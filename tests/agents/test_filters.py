@@ -83,7 +83,7 @@ def test_every_scenario_is_an_environment_and_every_road_another_one():
     for env, kind in product(ROADS, MECHANISMS):
         for scenario in drawn(dataclasses.replace(RANGES, envs=(env,)), n=2, kind=kind):
             config = make_config(scenario.env, scenario.keywords)
-            assert config.bandwidth <= config.corridor.n_mainline
+            assert config.bandwidth <= config.corridor.geometry.n_mainline
             assert config.privacy.preset == scenario.keywords["privacy"]["preset"]
             assert config.horizon == 240
     digests = {make_config(*parse_env(each)).corridor.digest for each in ROADS}
@@ -95,7 +95,7 @@ def test_every_scenario_is_an_environment_and_every_road_another_one():
 
 def test_highways_differ_in_everything_that_roads_differ_in():
     highways = [draw_highway(number) for number in range(100)]
-    lanes = {count for each in highways for count in each.segment_lanes}
+    lanes = {count for each in highways for count in each.geometry.segment_lanes}
     assert lanes == set(range(1, 7))
     limits, lengths = (
         [value for each in highways for value in getattr(each, name)]
@@ -104,9 +104,11 @@ def test_highways_differ_in_everything_that_roads_differ_in():
     assert (min(limits), max(limits)) == LIMITS
     assert LENGTHS[0] <= min(lengths) < 0.06
     assert 0.2 < max(lengths) <= LENGTHS[1]
-    assert {each.drivers.model for each in highways} == {"W99", "IDM", "Krauss"}
-    assert {0, 6} <= {each.n_ramps for each in highways}
-    least = [min(rate for _, rate in each.published_demand.mainline) for each in highways]
+    assert {each.conditions.drivers.model for each in highways} == {"W99", "IDM", "Krauss"}
+    assert {0, 6} <= {each.geometry.n_ramps for each in highways}
+    least = [
+        min(rate for _, rate in each.conditions.published_demand.mainline) for each in highways
+    ]
     assert min(least) < 300.0
     assert draw_highway(3) == draw_highway(3) != draw_highway(4)
 
@@ -117,36 +119,36 @@ def night():
     return next(
         number
         for number in range(1000)
-        if draw_highway(number).n_on_ramps
-        and draw_highway(number).n_off_ramps
-        and draw_highway(number).published_demand.mainline[0][1] < 1000.0
+        if draw_highway(number).geometry.n_on_ramps
+        and draw_highway(number).geometry.n_off_ramps
+        and draw_highway(number).conditions.published_demand.mainline[0][1] < 1000.0
     )
 
 
 @pytest.mark.parametrize("averaged", [0, 5])
 def test_a_section_has_the_vehicles_of_its_highway(night, averaged, tmp_path):
     library, highway = RecordLibrary(), draw_highway(night)
-    section = Section(night, highway.n_mainline - 2, 2, 100, averaged=averaged, seed=1)
+    section = Section(night, highway.geometry.n_mainline - 2, 2, 100, averaged=averaged, seed=1)
     road = read_corridor(section.write(tmp_path, library))
-    assert road.on_ramps == tuple(face - 1 for face in highway.on_ramps)
-    assert road.segment_lengths[0] == highway.segment_lengths[0]
-    assert road.published_demand.mainline[0][1] > 0.0
+    assert road.geometry.on_ramps == tuple(face - 1 for face in highway.geometry.on_ramps)
+    assert road.geometry.segment_lengths[0] == highway.geometry.segment_lengths[0]
+    assert road.conditions.published_demand.mainline[0][1] > 0.0
     start = json.loads((tmp_path / "manifest.json").read_text())["sources"][1]["start"]
     whole, cut = library.get(highway, 0), library.get(road, 1)
-    n, times = road.n_mainline, slice(start, start + 101)
+    n, times = road.geometry.n_mainline, slice(start, start + 101)
     counts = np.concatenate(
         [
             whole.counts[times, 1 : n + 1],
-            whole.counts[times, highway.n_mainline : highway.n_segments],
+            whole.counts[times, highway.geometry.n_mainline : highway.geometry.n_segments],
             whole.counts[times, [0, n + 1]],
-            whole.counts[times, highway.n_segments + 2 :],
+            whole.counts[times, highway.geometry.n_segments + 2 :],
         ],
         axis=1,
     )
     if not averaged:
         np.testing.assert_array_equal(cut.counts, counts)
         return
-    lengths = np.array(road.with_boundaries(road.segment_lengths))
+    lengths = np.array(road.geometry.with_boundaries(road.geometry.segment_lengths))
     around = np.stack([counts[k - 2 : k + 3].mean(axis=0) for k in range(2, 99)])
     np.testing.assert_allclose(cut.field[2:-2, :, 0], around / lengths, atol=1e-9)
 
@@ -157,7 +159,7 @@ def test_scenarios_on_sections_are_played(night):
         (scenario,) = drawn(ranges, n=1, kind=kind, on_section=True)
         collected = collect(scenario, WALK, None)
         assert collected.truth.shape[:2] == (240, 4)
-        assert collected.corridor.n_mainline == scenario.section.segments
+        assert collected.corridor.geometry.n_mainline == scenario.section.segments
 
 
 # Episodes -----------------------------------------------------------------------------------------
@@ -217,7 +219,7 @@ def test_the_network_with_gradients_is_the_estimator(mechanism, tmp_path):
     env, seen = make_vector(SHORT, 2, {**keywords, "action": "scores"}), Seen()
     seeds, noise = scenario.traffic_seeds, scenario.noise_seed
     evaluate(env, scenario.schedule, seeds, noise, watchers=[seen.begin])
-    batch, T = Batch([collected.pick(np.arange(2))]), collected.corridor.duration
+    batch, T = Batch([collected.pick(np.arange(2))]), collected.corridor.conditions.duration
     for (_, present), estimate in zip(steps(network, batch, T), seen.estimates[1:], strict=True):
         said = present.reshape(*estimate.density.shape, 4)
         np.testing.assert_allclose(said[..., 0], estimate.density, rtol=2e-4, atol=2e-3)
@@ -267,10 +269,10 @@ def test_the_loss_is_the_environments_error():
     roads, truth = batch.roads, batch.truth
     estimated = torch.cat([truth, torch.ones_like(truth)], -1)
     assert float(second_loss(roads, estimated, truth, 0.0)) == pytest.approx(1e-4)
-    off = estimated + torch.tensor([corridor.density_scale * 0.1, 0.0, 0.0, 0.0])
+    off = estimated + torch.tensor([corridor.scales.density_scale * 0.1, 0.0, 0.0, 0.0])
     by_episode = truth.reshape(len(truth), 2, -1, 2)
-    occupied = (by_episode[:, :, : corridor.n_mainline, 0] > 0).float()
-    share = corridor.n_mainline / (corridor.n_mainline + occupied.sum(-1))
+    occupied = (by_episode[:, :, : corridor.geometry.n_mainline, 0] > 0).float()
+    share = corridor.geometry.n_mainline / (corridor.geometry.n_mainline + occupied.sum(-1))
     expected = float((0.1 * share.sqrt()).mean())
     assert float(second_loss(roads, off, truth, 0.0)) == pytest.approx(expected, 1e-3)
     wide = estimated * torch.tensor([1.0, 1.0, 50.0, 50.0])

@@ -44,8 +44,8 @@ def test_more_noise_costs():
     density[:, 2] = 90.0
     field = Field(density, speed, 0.1)
     corridor = field_corridor(field, 3, 102.0)
-    assert corridor.density_scale == 333.0
-    assert corridor.average_dwell == pytest.approx(4.0)
+    assert corridor.scales.density_scale == 333.0
+    assert corridor.scales.average_dwell == pytest.approx(4.0)
     keywords = {"corridor": corridor, "estimator": "random_walk", "bandwidth": 1}
 
     def run(**privacy):

@@ -142,7 +142,7 @@ def test_a_network_becomes_a_fitted_road(run_guide):
     printed, _ = run_guide("your-network.md")
     assert "on-ramp at face 4: on" in printed
     road = read_corridor("town.toml")
-    assert (road.n_mainline, road.off_ramps) == (15, (11,))
+    assert (road.geometry.n_mainline, road.geometry.off_ramps) == (15, (11,))
     assert Path("town-fit/page.html").is_file()
 
 

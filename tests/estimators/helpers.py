@@ -66,7 +66,7 @@ def model_of(parameters: str, release: str, road: Corridor = PAPER_HIGHWAY) -> A
     speed = None if release == "speed" else REFERENCE_SPEED
     channels = None
     if release == "rows":
-        channels = every_channel(len(road.segment_lengths), road.n_mainline)
+        channels = every_channel(road.road.n_segments, road.road.n_mainline)
     return ARZModel(road.road, load_parameters(parameters), centre=speed, channels=channels)
 
 
@@ -96,7 +96,7 @@ def simulate(
     filling = 0.06 + 0.04 * np.sin(2.0 * np.pi * t / 90.0 + phase)
     filling[200:400, :, 0] += 0.06
     filling[200:400, :, 1] += 0.25
-    rho = filling * per_lane * np.array(road.boundary_lanes)
+    rho = filling * per_lane * np.array(road.geometry.boundary_lanes)
     v = v_f * (1.0 - filling**model.parameters.gamma)
     inputs = np.stack([model.boundary_inputs(a, b) for a, b in zip(rho, v, strict=True)])
 
@@ -133,7 +133,7 @@ def recorded(release: str) -> Episodes:
     record = RecordLibrary().get(PAPER_HIGHWAY, 3)
     model, sigma = model_of("w99-3lane", release), SPEEDS if release == "speed" else FLOWS
     s, v_f = model.n_segments, model.parameters.free_flow_speed
-    density = record.counts / PAPER_HIGHWAY.segment_length
+    density = record.counts / PAPER_HIGHWAY.geometry.segment_length
     sums, counts = record.speed_sums, record.counts
     speed = np.divide(sums, counts, out=np.full(sums.shape, np.nan), where=counts > 0)
     inputs = model.boundary_inputs(density[:-1, s:], speed[:-1, s:])

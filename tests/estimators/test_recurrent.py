@@ -280,8 +280,8 @@ def test_a_pair_is_found_by_the_name_it_shares(tmp_path):
         (PAPER_HIGHWAY, False, "highway-speeds"),
         (CORRIDORS["long-highway"], True, "long-highway-flows"),
         (CORRIDORS["long-highway"], False, "roads-speeds"),
-        (PAPER_HIGHWAY.replaced({"speed_limit": 100.0}), True, "roads-flows"),
-        (PAPER_HIGHWAY.replaced({"speed_limit": 30.0}), True, "roads-flows"),
+        (PAPER_HIGHWAY.replaced(speed_limit=100.0), True, "roads-flows"),
+        (PAPER_HIGHWAY.replaced(speed_limit=30.0), True, "roads-flows"),
     ],
 )
 def test_the_network_of_the_package_that_knows_a_road_is_taken(road, flows, network):

@@ -1,6 +1,5 @@
 """Small trajectories, and files of them in each format."""
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -8,17 +7,17 @@ import numpy as np
 
 from dptse_env.importers import Options, Source, Split, import_trajectories
 from dptse_env.importers.placing import Branches
-from dptse_env.traffic import Corridor, Demand
+from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Scales
 
 ROAD = Corridor(
-    name="test-road", n_mainline=4, on_ramps=(1,), off_ramps=(3,), exit_shares=(0.1,),
-    demand=Demand(((0.0, 0.0),), (0.0,)), incident=None, fixed_sensors=(), duration=20,
-)  # fmt: skip
+    "test-road",
+    Geometry(4, on_ramps=(1,), off_ramps=(3,), exit_shares=(0.1,)),
+    Conditions(Demand(((0.0, 0.0),), (0.0,)), duration=20),
+    Scales(333.0, 102.0, 8.0),
+)
 """Four segments of 100 m: an on-ramp joins at 100 m, an off-ramp leaves at 300 m."""
 
-STRAIGHT = dataclasses.replace(
-    ROAD, on_ramps=(), off_ramps=(), exit_shares=(), demand=Demand(((0.0, 0.0),))
-)
+STRAIGHT = ROAD.replaced(on_ramps=(), off_ramps=(), exit_shares=(), demand=Demand(((0.0, 0.0),)))
 """The same without ramps."""
 
 SPLITS = [
@@ -71,7 +70,7 @@ def run(path, source=PLAIN, road=STRAIGHT, splits=SPLITS, **options):
 
 def first_file(imported):
     """Return what the report says of the first file, as it was written."""
-    path = Path(imported.corridor.recordings.folder) / "report.json"
+    path = Path(imported.corridor.source.recordings.folder) / "report.json"
     content = json.loads(path.read_text(encoding="utf-8"))
     assert content == imported.report
     return content["files"][0]

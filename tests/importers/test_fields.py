@@ -40,8 +40,8 @@ def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
     corridor, seeds = import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
     assert seeds == {"training": (0, 1), "validation": (1000,), "test": (2000,)}
     assert read_corridor(str(tmp_path / "road" / "road.toml")) == corridor
-    assert corridor.segment_length == pytest.approx(0.1)
-    assert corridor.density_scale == 444.0
+    assert corridor.geometry.segment_length == pytest.approx(0.1)
+    assert corridor.scales.density_scale == 444.0
     assert corridor.measured == ("demand", "average_dwell")
     library = RecordLibrary(tmp_path / "cache")
     first, second = (library.get(corridor, seed) for seed in (0, 1))
@@ -55,7 +55,7 @@ def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
     assert np.argmax(densities[0][50]) == 4
     expected = 0.01 / 0.0003048 * (1.0 + 0.1 * 2.5 + 0.01 * (50.0 / 5.0 - 0.5))
     assert densities[0][50, 0] == pytest.approx(expected, rel=1e-6)
-    demand = corridor.demand.mainline[0][1]
+    demand = corridor.conditions.demand.mainline[0][1]
     flows = [record.field[:, 0].prod(axis=-1) for record in (first, second)]
     assert demand == pytest.approx(np.mean(flows), rel=1e-3)
 

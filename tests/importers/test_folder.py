@@ -97,7 +97,7 @@ def test_a_mainline_that_nobody_drives_on_is_told(tmp_path):
     (tmp_path / "imported").rename(tmp_path / "first")
     path = plain(tmp_path / "b.csv", points, lane=np.full(len(points), 7))
     with pytest.raises(ValueError, match="files must be with vehicles on the mainline"):
-        run(path, source, dataclasses.replace(ROAD, on_ramps=(3,), off_ramps=(), exit_shares=()))
+        run(path, source, ROAD.replaced(on_ramps=(3,), off_ramps=(), exit_shares=()))
     assert {each.name for each in tmp_path.iterdir()} == {"a.csv", "first", "b.csv"}
 
 

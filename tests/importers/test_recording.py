@@ -241,7 +241,7 @@ def test_ramps_are_told_by_lanes_or_lateral_positions(tmp_path):
         imported = run(path, source, ROAD)
         counts.append(record_of(imported).counts)
         assert first_file(imported)["off_lanes"] == 0
-        assert imported.corridor.demand.on_ramps[0] == pytest.approx(300.0, rel=0.3)
+        assert imported.corridor.conditions.demand.on_ramps[0] == pytest.approx(300.0, rel=0.3)
     np.testing.assert_array_equal(*counts)
     # Vehicles of the ramp are on it to the face at 100 m, then on the mainline, as on lane 7 at
     # 100 to 150 m; those of the off-ramp likewise: two thirds of all before and behind.

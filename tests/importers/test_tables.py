@@ -407,9 +407,7 @@ def test_fcd_that_does_not_fit_the_road_is_refused(fcd, tmp_path):
 
 def test_an_uneven_road_with_long_ramps_is_imported_number_for_number(tmp_path, monkeypatch):
     lengths = (0.1, 0.15, 0.08, 0.1, 0.12, 0.1)
-    road = dataclasses.replace(
-        SHORT_HIGHWAY, segment_length=lengths, ramp_segments=(2, 3), duration=90
-    )
+    road = SHORT_HIGHWAY.replaced(segment_length=lengths, ramp_segments=(2, 3), duration=90)
     path = tmp_path / "fcd.csv"
     monkeypatch.setattr(sumo, "OPTIONS", (*sumo.OPTIONS, *output_to(path)))
     recorded = simulate(road, 0)
@@ -417,7 +415,7 @@ def test_an_uneven_road_with_long_ramps_is_imported_number_for_number(tmp_path, 
     for name in Record.COLUMNS:
         np.testing.assert_array_equal(getattr(record, name), getattr(recorded, name))
     # By position: edges of the mainline start at kilometres.
-    edges = {name: name for name in edge_ids(road)}
+    edges = {name: name for name in edge_ids(road.geometry)}
     edges |= {f"main_{i}": float(sum(lengths[:i])) for i in range(6)}
     record = import_fcd(path, tmp_path / "by-position", road, layout=Layout(edges=edges))
     assert (record.counts != recorded.counts).mean() < 0.005

@@ -24,8 +24,8 @@ from dptse_env.process import QueryProcess
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, randomised
 from tests.release.worlds import ONE
 
-CENTRE = 0.5 * SHORT_HIGHWAY.speed_limit
-R = SHORT_HIGHWAY.n_boundaries
+CENTRE = 0.5 * SHORT_HIGHWAY.geometry.speed_limit
+R = SHORT_HIGHWAY.geometry.n_boundaries
 
 
 def make(kind, preset="capped", n_episodes=1):
@@ -175,14 +175,14 @@ def test_flows_add_up_along_the_road_at_the_demand_of_the_moment():
 
 def test_shares_of_exits_that_the_demand_has_by_time_go_before_the_road_s():
     shares = ((0.0, 0.1), (200.0, 0.5)), ((0.0, 0.2),)
-    demand = dataclasses.replace(PAPER_HIGHWAY.demand, exit_shares=shares)
-    flows = nominal_flows(dataclasses.replace(PAPER_HIGHWAY, demand=demand), np.array([100, 300]))
+    demand = dataclasses.replace(PAPER_HIGHWAY.conditions.demand, exit_shares=shares)
+    flows = nominal_flows(PAPER_HIGHWAY.replaced(demand=demand), np.array([100, 300]))
     np.testing.assert_allclose(flows[:, 17], [237.0, 3185.0])
     np.testing.assert_allclose(flows[:, 18], 0.2 * flows[:, 11])
 
 
 def test_a_distribution_counts_with_its_base_and_neither_incident_nor_draws_count(model):
-    random = dataclasses.replace(PAPER_HIGHWAY, demand=DemandDistribution(PAPER_HIGHWAY.demand))
+    random = PAPER_HIGHWAY.replaced(demand=DemandDistribution(PAPER_HIGHWAY.conditions.demand))
     expected = nominal_inputs(PAPER_HIGHWAY, model)
     for road in (random, randomised(PAPER_HIGHWAY)):
         assert road != PAPER_HIGHWAY

@@ -9,8 +9,8 @@ from dptse_env.release import CappedSettings, Corrected, Paced, PacedSettings, Q
 from dptse_env.traffic import SHORT_HIGHWAY
 from tests.release.worlds import task_of
 
-LENGTH, LIMIT, SPREAD = 0.1, SHORT_HIGHWAY.speed_limit, 12.0
-S, N = SHORT_HIGHWAY.n_segments, SHORT_HIGHWAY.n_mainline
+LENGTH, LIMIT, SPREAD = 0.1, SHORT_HIGHWAY.geometry.speed_limit, 12.0
+S, N = SHORT_HIGHWAY.geometry.n_segments, SHORT_HIGHWAY.geometry.n_mainline
 SPEED, CENTRE = 70.0, 60.0
 
 

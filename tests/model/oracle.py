@@ -86,7 +86,8 @@ class Oracle:
     imaginary axis gives derivatives without rounding.
     """
 
-    def __init__(self, network, parameters, time_step=1.0):
+    def __init__(self, road, parameters, time_step=1.0):
+        network = road.geometry
         per_lane = parameters.jam_density / parameters.lanes
         self.network, self.v_f, self.gamma = network, parameters.free_flow_speed, parameters.gamma
         self.jam = per_lane * np.array(network.segment_lanes)

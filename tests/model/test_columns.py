@@ -76,7 +76,7 @@ def test_kernels_project_one_state_and_many_as_the_model_does(road, parameters, 
 def test_a_channel_of_many_states_is_what_the_model_measures(road, parameters, flows):
     """States with negative components among them, as those of members ahead of a projection."""
     span = (1, 2, 3) if flows else (1, 1, 1)
-    n = len(road.segment_lengths)
+    n = len(road.geometry.segment_lengths)
     channels = make_channels((n - 1, 0, 2), span)
     model = ARZModel(road.road, parameters, centre=51.0 if flows else None, channels=channels)
     rng, width = np.random.default_rng(0), np.empty((3, WIDTH))

@@ -96,10 +96,10 @@ def test_a_flow_is_a_sum_of_centred_and_clipped_speeds():
     "groups", [WHOLE, (Group("queries", 0.5, Penetration(0.3)), Group("sensors", 0.5))]
 )
 def test_an_empty_segment_or_sensor_has_its_own_speed_limit(groups):
-    road = dataclasses.replace(short_road(1), fixed_sensors=(3, 5, 7), ramp_speed_limit=60.0)
+    road = short_road(1).replaced(fixed_sensors=(3, 5, 7), ramp_speed_limit=60.0)
     empty = Worlds(stays(0, 0.0, 1, present=False), road=road)
     release = empty.started(PrivacySettings("paper"), groups=groups)
-    every, task = np.array(road.with_boundaries(road.speed_limits)), release.task
+    every, task = np.array(road.geometry.with_boundaries(road.geometry.speed_limits)), release.task
     found = release.true_values(request(1, n_columns=task.n_channels))
     np.testing.assert_array_equal(found[0, :, 1], every[task.channels.first])
     assert {60.0, LIMIT} == set(every)
@@ -135,8 +135,8 @@ def test_the_cap_belongs_to_trips_and_without_it_values_are_the_aggregates():
 
 @pytest.mark.parametrize("preset", ["paper", "corrected", "capped"])
 def test_a_vehicle_counts_alike_on_every_segment_in_units_of_the_noise(preset):
-    road = dataclasses.replace(UNEVEN, duration=T)
-    n_columns = road.n_segments + road.n_boundaries
+    road = UNEVEN.replaced(duration=T)
+    n_columns = road.geometry.n_segments + road.geometry.n_boundaries
     asked = RELEASE_MODELS[preset].settings_type(preset=preset, epsilon=5.0)
     release = Worlds(crowd(200, last=n_columns, n_columns=n_columns), road=road).started(asked)
     every = request(1, n_columns=n_columns)
@@ -225,8 +225,8 @@ def test_the_extremes_of_the_proof_are_met_and_no_more(share, cap):
 
 
 def test_on_segments_of_unequal_length_the_whole_of_mu_is_reached():
-    road = dataclasses.replace(UNEVEN, duration=T)
-    n_columns = road.n_segments + road.n_boundaries
+    road = UNEVEN.replaced(duration=T)
+    n_columns = road.geometry.n_segments + road.geometry.n_boundaries
     standing = (np.full((1, T + 1), segment) for segment in (4, 5))  # the longest, the shortest
     worlds = Worlds(*(record(at, 0.0 * at, n_columns) for at in standing), road=road)
     found = squared_distance(worlds.release(CappedSettings(cap=4)), np.ones((T, n_columns), bool))
@@ -242,7 +242,7 @@ def test_the_sensitivity_of_the_paper_is_exceeded():
     found = squared_distance(release, every, [release.sigma[0], np.inf])
     claimed = release.report().releases[0]
     # Two queries, two fixed sensors and four boundary segments, each passed once for the average.
-    dwell = release.task.corridor.average_dwell
+    dwell = release.task.corridor.scales.average_dwell
     assert claimed.sensitivity == pytest.approx(10.0 * math.sqrt(2 * 8 * dwell))
     assert found == pytest.approx(claimed.mu**2 * 2 * steps / (2 * 8 * dwell), rel=1e-12)
     assert found > 3.0 * claimed.mu**2

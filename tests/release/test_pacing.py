@@ -1,7 +1,5 @@
 """Pacings: prices from public numbers, beside the same prices written out place by place."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,11 @@ from tests.helpers import UNEVEN
 from .worlds import ONE, WHOLE, task_of
 
 BUDGET, PACE, RATIO = 2.0, 0.8, 1.0
-N, S, LENGTH = SHORT_HIGHWAY.n_mainline, SHORT_HIGHWAY.n_segments, SHORT_HIGHWAY.segment_length
+N, S, LENGTH = (
+    SHORT_HIGHWAY.geometry.n_mainline,
+    SHORT_HIGHWAY.geometry.n_segments,
+    SHORT_HIGHWAY.geometry.segment_length,
+)
 SHARE = 1.0 + 0.15 * RATIO
 """Expected payment over the price."""
 STANDING = 0.0
@@ -26,8 +28,10 @@ def make(
     boundary="nominal", n_episodes=1, groups=WHOLE,
 ):  # fmt: skip
     """A pacing of half the road a second, unless another bandwidth is given."""
-    road = dataclasses.replace(road, fixed_sensors=sensors)
-    queries = QueryOptions.make(road.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1)
+    road = road.replaced(fixed_sensors=sensors)
+    queries = QueryOptions.make(
+        road.geometry.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1
+    )
     settings = PacedSettings(pace=PACE, ratio=RATIO, boundary_inputs=boundary)
     task = task_of(Paced, settings, road, queries, n_episodes, groups)
     pacing = kind(task, BUDGET * task.shares)
@@ -40,7 +44,7 @@ def prices_of(pacing, observed, density=10.0, speed=60.0, episodes=ONE):
     task = pacing.task
     flags = np.zeros((len(episodes), task.n_channels), dtype=bool)
     flags[:, observed] = True
-    shape = len(episodes), task.corridor.n_segments
+    shape = len(episodes), task.corridor.geometry.n_segments
     given = (np.broadcast_to(value, shape).astype(float) for value in (density, speed))
     return pacing.prices(episodes, flags, *given)
 
@@ -145,7 +149,7 @@ def test_prices_and_the_spent_share_are_as_when_written_out(keywords):
     pacing, generator = make(**keywords), np.random.default_rng(0)
     task = pacing.task
     plain = [PlainPacing(task, group) for group in range(len(task.groups))]
-    n, n_segments = task.corridor.n_mainline, task.corridor.n_segments
+    n, n_segments = task.corridor.geometry.n_mainline, task.corridor.geometry.n_segments
     for second in range(150):
         density = generator.choice([0.0, 10.0, 60.0, 250.0], n_segments)
         speed = generator.choice([STANDING, 4.0, 30.0, 100.0, 400.0], n_segments)

@@ -1,14 +1,12 @@
 """Query options, and the rows of a release that answer them."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from dptse_env.release import QueryOptions
 from dptse_env.traffic import SHORT_HIGHWAY
 
-ROAD = dataclasses.replace(SHORT_HIGHWAY, fixed_sensors=(5, 7, 2))  # 6 mainline segments, 2 ramps
+ROAD = SHORT_HIGHWAY.replaced(fixed_sensors=(5, 7, 2))  # 6 mainline segments, 2 ramps
 
 
 def flags(n, *places):

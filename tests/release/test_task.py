@@ -32,15 +32,15 @@ def test_channels_are_those_of_the_road_and_then_boundary_cells():
 
 def test_a_channel_is_as_long_as_what_it_covers():
     settings = PrivacySettings("corrected", boundary_inputs="private")
-    options = QueryOptions.make(UNEVEN.n_mainline, 2)
+    options = QueryOptions.make(UNEVEN.geometry.n_mainline, 2)
     uneven = task_of(Corrected, settings, UNEVEN, options)
     np.testing.assert_array_equal(uneven.channels.length, UNEVEN.road.lengths)
 
 
 def test_a_model_has_the_channels_and_the_centre_of_the_task():
     config = resolve("short-highway", {"privacy": SumRelease, "query_spans": (1, 2)})
-    model, expected = make_model(config), make_task(config)
+    model, expected, road = make_model(config), make_task(config), config.corridor.geometry
     np.testing.assert_array_equal(model.channels.first, expected.channels.first)
     np.testing.assert_array_equal(model.channels.span, expected.channels.span)
-    assert model.centre == expected.centre == 0.5 * config.corridor.speed_limit
+    assert model.centre == expected.centre == 0.5 * road.speed_limit
     assert not task(preset=MeanRelease).releases_flow

@@ -1,7 +1,5 @@
 """The true traffic in memory, and ledgers beside the same ledgers written out in Python."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -36,7 +34,7 @@ def test_aggregates_and_vehicles_are_those_of_the_second_and_groups_see_some_of_
     record = traffic.library.get(SHORT_HIGHWAY, 7)
     own, second = record.step == 120, (np.array([1]), np.array([120]))
     (answer,) = traffic.aggregates(*second)
-    for segment in range(SHORT_HIGHWAY.n_segments):
+    for segment in range(SHORT_HIGHWAY.geometry.n_segments):
         here = record.speed[own & (record.segment == segment)].astype(float)
         mean = here.mean() if len(here) else LIMIT
         assert answer[segment] == pytest.approx([len(here) / 0.1, mean])
@@ -50,12 +48,14 @@ def test_aggregates_and_vehicles_are_those_of_the_second_and_groups_see_some_of_
 
 
 def test_an_empty_segment_has_its_own_limit_and_a_density_its_own_length():
-    road = dataclasses.replace(UNEVEN, duration=T)
-    n_columns = road.n_segments + road.n_boundaries
+    road = UNEVEN.replaced(duration=T)
+    n_columns = road.geometry.n_segments + road.geometry.n_boundaries
     whole = crowd(seed=3, last=n_columns, n_columns=n_columns)
     table = Traffic(road, (0,), Worlds(whole))
     table.load(0)
-    lengths, limits = map(road.with_boundaries, (road.segment_lengths, road.speed_limits))
+    lengths, limits = map(
+        road.geometry.with_boundaries, (road.geometry.segment_lengths, road.geometry.speed_limits)
+    )
     density, speed = np.moveaxis(table.complete(0), -1, 0)
     np.testing.assert_allclose(density * np.array(lengths), whole.counts)
     empty = whole.counts == 0

@@ -20,7 +20,7 @@ ONE, BOTH = np.arange(1), np.arange(2)
 T, COLUMNS, SEGMENTS = 8, 12, 8
 """Seconds, record columns and segments of the short road."""
 
-LIMIT, LENGTH = SHORT_HIGHWAY.speed_limit, SHORT_HIGHWAY.segment_length
+LIMIT, LENGTH = SHORT_HIGHWAY.geometry.speed_limit, SHORT_HIGHWAY.geometry.segment_length
 
 
 def drives(places, speed):
@@ -48,8 +48,8 @@ def streams(*seeds):
 def task_of(model, settings, road, queries, n_episodes=1, groups=WHOLE):
     """What a release model of a class measures of a road in a batch of episodes."""
     return Task(
-        settings.preset, settings, road, queries, road.duration, model.centre(road, settings),
-        model.has_prices, n_episodes, groups,
+        settings.preset, settings, road, queries, road.conditions.duration,
+        model.centre(road, settings), model.has_prices, n_episodes, groups,
     )  # fmt: skip
 
 
@@ -71,7 +71,7 @@ class Worlds:
         n = len(self.records)
         settings = dataclasses.replace(settings, boundary_inputs="private")
         queries = QueryOptions.make(
-            self.road.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1
+            self.road.geometry.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1
         )
         model = kind or RELEASE_MODELS[settings.preset]
         task = task_of(model, settings, self.road, queries, n, groups)

@@ -38,7 +38,7 @@ def raw(road, name, observation):
 def test_mainline_blocks_stand_at_their_segments():
     for preset, flow in (("paper-highway", False), ("long-highway", True)):
         config = PRESETS[preset]
-        road, n = RoadChannels.from_config(config), config.corridor.n_mainline
+        road, n = RoadChannels.from_config(config), config.corridor.geometry.n_mainline
         observation, starts = numbered(config)
         released = "released_flow" if flow else "released_speed"
         for name in ("density", "speed_log_std", "released_density", released, "age", "queried"):

@@ -18,7 +18,11 @@ class Plain:
         process = env.unwrapped.process
         config, model, estimator = process.config, process.model, process.estimator
         corridor, settings, one = config.corridor, config.settings(), np.array([episode])
-        n, self.n, self.fixed = 2 * model.n_segments, corridor.n_mainline, corridor.fixed_sensors
+        n, self.n, self.fixed = (
+            2 * model.n_segments,
+            corridor.geometry.n_mainline,
+            corridor.fixed_sensors,
+        )
         scale, mean = model.state_scale[:n], estimator.states[[episode], :n]
         P = estimator.covariances[episode, :n, :n] if covariance is None else covariance
         F, Q = np.eye(n), np.diag(np.tile(np.square(NOISE), model.n_segments))
@@ -36,9 +40,11 @@ class Plain:
         self.H = (rows[:, :, :n] * scale / model.measurement_scale[:, None]).reshape(n, n)
         sigma = np.array(settings.noise_scale) * process.expected_sigma / model.measurement_scale
         self.R = np.tile(sigma**2, model.n_segments)
-        T = self.traffic(model, mean, scale, [corridor.density_scale, corridor.speed_scale])
+        T = self.traffic(
+            model, mean, scale, [corridor.scales.density_scale, corridor.scales.speed_scale]
+        )
         self.T, self.weights = T[: 2 * self.n], np.ones((self.n, 2))
-        occupied = 1.0 - np.exp(-corridor.segment_length * mean[0, : 2 * self.n : 2])
+        occupied = 1.0 - np.exp(-corridor.geometry.segment_length * mean[0, : 2 * self.n : 2])
         self.weights[:, 1] = occupied * np.minimum(1.0, CAP**2 / self.variances([])[:, 1])
         self.weights *= [config.reward != "speed", config.reward != "density"]
 

@@ -180,11 +180,13 @@ def test_the_expected_reduction_is_that_of_independent_updates(privacy, term):
     process.age = rng.integers(0, 20, process.age.shape)
     action, _ = make_schedule("expected-reduction", env).predict(observation)
 
-    P, Q = spread[:, :, : corridor.n_mainline] ** 2
-    noise = sigma[1] / density[:, : corridor.n_mainline] if privacy == "capped" else sigma[1]
-    value = (Q - 1.0 / (1.0 / Q + 1.0 / noise**2)) / corridor.speed_scale**2
+    P, Q = spread[:, :, : corridor.geometry.n_mainline] ** 2
+    noise = (
+        sigma[1] / density[:, : corridor.geometry.n_mainline] if privacy == "capped" else sigma[1]
+    )
+    value = (Q - 1.0 / (1.0 / Q + 1.0 / noise**2)) / corridor.scales.speed_scale**2
     if term == "joint":
-        value += (P - 1.0 / (1.0 / P + 1.0 / sigma[0] ** 2)) / corridor.density_scale**2
+        value += (P - 1.0 / (1.0 / P + 1.0 / sigma[0] ** 2)) / corridor.scales.density_scale**2
     value *= process.age + 1.0
     value[:, 5] = -1.0  # it has a fixed sensor
     np.testing.assert_array_equal(np.argmax(action, axis=1), np.argmax(value, axis=1))

@@ -1,6 +1,5 @@
 """Import of trajectories, of a field and of a network, by the command."""
 
-import dataclasses
 import json
 import re
 import shlex
@@ -91,10 +90,10 @@ def test_a_mapping_describes_the_data(road, tmp_path):
         "trajectories", "--files", path, "--env", on(road), "--output", tmp_path / "new",
         "--mapping", tmp_path / "data.toml", "--shares", "1", "0", "0",
     )  # fmt: skip
-    assert read_corridor(tmp_path / "new" / "road.toml").n_mainline == 4
+    assert read_corridor(tmp_path / "new" / "road.toml").geometry.n_mainline == 4
     assert (
         RecordLibrary().get(read_corridor(tmp_path / "new" / "road.toml"), 4).n_steps
-        == STRAIGHT.duration + 1
+        == STRAIGHT.conditions.duration + 1
     )
 
 
@@ -124,7 +123,7 @@ def fifteen_minutes(tmp_path_factory):
         (folder / name).write_text(content)
     flows = Demand(((0.0, 4000.0), (300.0, 6500.0), (600.0, 4500.0)), (400.0,))
     road = read_corridor(folder / "road.toml")
-    road = dataclasses.replace(road, demand=flows, duration=899)
+    road = road.replaced(demand=flows, duration=899)
     points, column = driven(RecordLibrary(folder / "records").get(road, 0), road)
     columns = ngsim(points + np.array([0.0, 0.0, 66.0 * FOOT, 0.0]))
     columns["Vehicle_ID"] %= 25  # some are there twice at one time, as in the portal's file
@@ -173,7 +172,7 @@ def test_the_page_on_own_data_imports_a_field(tmp_path, monkeypatch):
     np.savetxt("speed.txt", 110.0 - waves)
     printed = run(*commands_of("your-data.md")[-1][1:])
     assert "training: 1 window(s), traffic seeds 0\n" in printed
-    assert read_corridor("ring-road/road.toml").n_mainline == 6
+    assert read_corridor("ring-road/road.toml").geometry.n_mainline == 6
 
 
 @pytest.mark.slow
@@ -265,7 +264,7 @@ def test_what_is_imported_can_be_played_as_the_last_line_says(tmp_path):
     env, keywords = parse_env(shlex.split(last)[shlex.split(last).index("--env") + 1])
     with pytest.warns(UserWarning, match="values measured or tuned on"):
         made = gym.make(env, **keywords)
-    assert made.unwrapped.config.corridor.n_mainline == 2
+    assert made.unwrapped.config.corridor.geometry.n_mainline == 2
 
 
 @pytest.mark.parametrize(

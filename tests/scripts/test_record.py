@@ -1,6 +1,5 @@
 """Records by the command."""
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from tests.scripts.commands import run_command
 
 
 def test_what_an_environment_replays_is_recorded(tmp_path):
-    calm = dataclasses.replace(SHORT_HIGHWAY, duration=60, incident=None)
+    calm = SHORT_HIGHWAY.replaced(duration=60, incident=None)
     library = RecordLibrary(tmp_path)
     for keywords, corridor, seeds in (
         ("", SHORT_HIGHWAY, (3, 4)),

@@ -10,16 +10,18 @@ from dptse_env.spaces.observations import (
     ObservationEncoding,
     PublicState,
 )
-from dptse_env.traffic import Corridor, Demand
+from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Scales
 from tests.helpers import SumRelease
 from tests.release.worlds import task_of
 
 N, S = 4, 6
 ROAD = Corridor(
-    name="road", n_mainline=N, on_ramps=(1,), off_ramps=(2,), exit_shares=(0.1,),
-    demand=Demand(((0.0, 1000.0),), (100.0,)), incident=None, fixed_sensors=(3, 5), duration=100,
-    density_scale=100.0, speed_scale=50.0,
-)  # fmt: skip
+    "road",
+    Geometry(N, on_ramps=(1,), off_ramps=(2,), exit_shares=(0.1,)),
+    Conditions(Demand(((0.0, 1000.0),), (100.0,)), duration=100),
+    Scales(density_scale=100.0, speed_scale=50.0, average_dwell=8.0),
+    fixed_sensors=(3, 5),
+)
 
 
 def encoding(blocks=("default",), epsilon=0.1, model=Corrected, **changes):

@@ -1,15 +1,13 @@
 """Errors of estimates, and rewards of them."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from dptse_env.spaces.rewards import ErrorReward, ScoredSecond, estimation_error
 from dptse_env.traffic import SHORT_HIGHWAY, Demand
 
-ROAD = dataclasses.replace(
-    SHORT_HIGHWAY, n_mainline=2, on_ramps=(), off_ramps=(), exit_shares=(), fixed_sensors=(),
+ROAD = SHORT_HIGHWAY.replaced(
+    n_mainline=2, on_ramps=(), off_ramps=(), exit_shares=(), fixed_sensors=(),
     demand=Demand(((0.0, 1000.0),)), incident=None, density_scale=100.0, speed_scale=50.0,
 )  # fmt: skip
 

@@ -1,6 +1,5 @@
 """Corridors with recordings: their records are read, never made."""
 
-import dataclasses
 import pickle
 import shutil
 from pathlib import Path
@@ -25,7 +24,7 @@ from dptse_env.traffic import (
 from dptse_env.traffic.imported import record_path, recorded_seeds, save_record, write_manifest
 from dptse_env.traffic.roads import write_corridor
 
-FREE = dataclasses.replace(SHORT_HIGHWAY, incident=None)
+FREE = SHORT_HIGHWAY.replaced(incident=None)
 SEEDS = (0, 1, 1000, 2000)
 
 
@@ -41,17 +40,17 @@ def write(folder, variants):
         save_record(folder, seed, FREE.record_layout, record)
     digests = {seed: record.digest for seed, record in records.items()}
     digest = write_manifest(folder, FREE.record_layout, digests, [])
-    corridor = dataclasses.replace(FREE, recordings=Recordings(str(folder), digest))
+    corridor = FREE.replaced(recordings=Recordings(str(folder), digest))
     write_corridor(folder / "road.toml", corridor)
     return corridor
 
 
 def synthetic(variant):
-    steps = np.arange(FREE.duration + 1)
+    steps = np.arange(FREE.conditions.duration + 1)
     return Record(
         step=steps, vehicle=np.full(len(steps), variant), segment=steps % 6,
-        speed=np.full(len(steps), 50.0 + variant), n_steps=FREE.duration + 1,
-        n_columns=FREE.n_segments + FREE.n_boundaries,
+        speed=np.full(len(steps), 50.0 + variant), n_steps=FREE.conditions.duration + 1,
+        n_columns=FREE.geometry.n_segments + FREE.geometry.n_boundaries,
     )  # fmt: skip
 
 
@@ -59,7 +58,7 @@ def synthetic(variant):
 def recorded(original, tmp_path):
     """Copy the folder, so that a test may damage it; return the copy's corridor."""
     folder = tmp_path / "moved"
-    shutil.copytree(original.recordings.folder, folder)
+    shutil.copytree(original.source.recordings.folder, folder)
     return read_corridor(folder / "road.toml")
 
 
@@ -88,7 +87,7 @@ def test_a_seed_that_was_not_recorded_is_refused_with_those_that_are(recorded):
 
 
 def test_a_damaged_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
-    paths = [record_path(recorded.recordings.folder, seed) for seed in (0, 1)]
+    paths = [record_path(recorded.source.recordings.folder, seed) for seed in (0, 1)]
     content = paths[0].read_bytes()
     paths[0].write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     with pytest.raises(InvalidRecordError, match="another digest"):
@@ -102,7 +101,7 @@ def test_a_damaged_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
     paths[1].rename(paths[0])
     with pytest.raises(InvalidRecordError, match="source is"):
         RecordLibrary().get(recorded, 0)
-    shutil.copy(record_path(other.recordings.folder, 0), paths[0])
+    shutil.copy(record_path(other.source.recordings.folder, 0), paths[0])
     with pytest.raises(InvalidRecordError, match="not the record that was imported"):
         RecordLibrary().get(recorded, 0)
 
@@ -117,21 +116,21 @@ def test_a_damaged_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
     ],
 )
 def test_a_damaged_manifest_is_an_error(change, message, recorded):
-    manifest = Path(recorded.recordings.folder) / "manifest.json"
+    manifest = Path(recorded.source.recordings.folder) / "manifest.json"
     manifest.write_text(change(manifest.read_text()))
     with pytest.raises(InvalidRecordError, match=message):
-        recorded_seeds(recorded.recordings)
-    folder = recorded.recordings.folder
+        recorded_seeds(recorded.source.recordings)
+    folder = recorded.source.recordings.folder
     digest = write_manifest(Path(folder), FREE.record_layout, {"x" * 1000: ""}, [])
     with pytest.raises(InvalidRecordError, match=r"manifest\.json: records must have .{1,150}$"):
         recorded_seeds(Recordings(folder, digest))
     manifest.unlink()
     with pytest.raises(InvalidRecordError, match="recordings cannot be read"):
-        recorded_seeds(recorded.recordings)
+        recorded_seeds(recorded.source.recordings)
 
 
 def test_the_digest_covers_the_content_and_not_the_folder(original, recorded, tmp_path):
-    assert recorded.recordings.folder != original.recordings.folder
+    assert recorded.source.recordings.folder != original.source.recordings.folder
     assert recorded.digest == original.digest
     assert recorded.digest != FREE.digest
     other = write(tmp_path / "other", (0, 1, 2, 9))
@@ -141,15 +140,15 @@ def test_the_digest_covers_the_content_and_not_the_folder(original, recorded, tm
 
 def test_recorded_traffic_has_a_fixed_demand_and_no_incident(recorded):
     with pytest.raises(ValueError, match=r"corridor\.incident must be None where traffic is rec"):
-        dataclasses.replace(recorded, incident=SHORT_HIGHWAY.incident)
+        recorded.replaced(incident=SHORT_HIGHWAY.conditions.incident)
     with pytest.raises(ValueError, match=r"corridor\.demand must be fixed where traffic is rec"):
-        dataclasses.replace(recorded, demand=randomised(SHORT_HIGHWAY).demand)
+        recorded.replaced(demand=randomised(SHORT_HIGHWAY).conditions.demand)
     with pytest.raises(RecordingError, match="its traffic is recorded, not simulated"):
         simulate(recorded, 0)
 
 
 def test_environments_replay_recordings(recorded):
-    road = {"corridor": f"{recorded.recordings.folder}/road.toml"}
+    road = {"corridor": f"{recorded.source.recordings.folder}/road.toml"}
     assert resolve("short-highway", road).traffic_seeds == (0, 1)  # those of training
     with pytest.raises(ValueError, match=r"must be one that was recorded .*, got 2\.\.63"):
         resolve("short-highway", {**road, "traffic_seeds": "0:64"})

@@ -37,10 +37,10 @@ def forbid_recording(monkeypatch):
 def tiny_record(path, seed):
     """Put a record of one row where the library looks for one."""
     one = np.ones(1)
-    columns = SHORT_HIGHWAY.n_segments + SHORT_HIGHWAY.n_boundaries
+    columns = SHORT_HIGHWAY.geometry.n_segments + SHORT_HIGHWAY.geometry.n_boundaries
     record = Record(
         step=one, vehicle=one, segment=one, speed=one,
-        n_steps=SHORT_HIGHWAY.duration + 1, n_columns=columns,
+        n_steps=SHORT_HIGHWAY.conditions.duration + 1, n_columns=columns,
     )  # fmt: skip
     source = library._source(SHORT_HIGHWAY, seed)
     record.save(RecordLibrary(path).record_path(SHORT_HIGHWAY, seed), source)

@@ -59,8 +59,8 @@ start = [100, 120]
 """
     road.write_text(text + several)
     corridor = read_corridor(road)
-    assert corridor.demand.ramp_profiles == (((0.0, 100.0), (60.0, 900.0)),)
-    kinds = [type(each).__name__ for each in corridor.incidents]
+    assert corridor.conditions.demand.ramp_profiles == (((0.0, 100.0), (60.0, 900.0)),)
+    kinds = [type(each).__name__ for each in corridor.conditions.incidents]
     assert kinds == ["Incident", "IncidentDistribution"]
     for each in (corridor, randomised(PAPER_HIGHWAY)):
         write_corridor(tmp_path / "road.toml", each, comment="a road\nin two lines")
@@ -72,12 +72,12 @@ def test_what_a_file_leaves_out_is_derived_from_the_road(road):
     read = read_road(road)
     corridor = read.corridor
     assert corridor.name == "my-road"
-    assert corridor.drivers.model == "IDM"
-    assert corridor.incident is None
+    assert corridor.conditions.drivers.model == "IDM"
+    assert corridor.conditions.incident is None
     assert corridor.fixed_sensors == ()
-    assert corridor.density_scale == 222.0
-    assert corridor.speed_scale == 90.0
-    assert corridor.average_dwell == pytest.approx(3 * 3600 * 0.2 / 90)
+    assert corridor.scales.density_scale == 222.0
+    assert corridor.scales.speed_scale == 90.0
+    assert corridor.scales.average_dwell == pytest.approx(3 * 3600 * 0.2 / 90)
     assert read.assumed == ("average_dwell",)
 
 
@@ -179,12 +179,12 @@ def test_the_keywords_of_a_file_come_after_the_callers(road):
 @pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)
 def test_randomised_traffic_keeps_the_road_and_the_base_demand(corridor):
     random = randomised(corridor)
-    assert random.demand == DemandDistribution(corridor.published_demand)
+    assert random.conditions.demand == DemandDistribution(corridor.conditions.published_demand)
     assert random.digest != corridor.digest
-    assert random.on_ramps == corridor.on_ramps
+    assert random.geometry.on_ramps == corridor.geometry.on_ramps
     assert randomised(random) == random
-    last_start = random.incident.start[1]
-    assert last_start + random.incident.duration[0] < corridor.duration
+    last_start = random.conditions.incident.start[1]
+    assert last_start + random.conditions.incident.duration[0] < corridor.conditions.duration
 
 
 @pytest.mark.parametrize("name", ["ekf.json", "networks/mine-flows.safetensors"])

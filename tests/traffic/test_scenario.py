@@ -1,7 +1,5 @@
 """Scenarios: arrivals, routes, classes and incidents of a traffic seed."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -35,7 +33,7 @@ def test_departures_are_ordered_and_every_exit_lies_ahead_of_its_origin(seed):
     scenario = draw_scenario(PAPER_HIGHWAY, seed)
     assert np.all(np.diff(scenario.departures) >= 0)
     assert scenario.departures.min() >= 0
-    assert scenario.departures.max() <= PAPER_HIGHWAY.duration
+    assert scenario.departures.max() <= PAPER_HIGHWAY.conditions.duration
     second_ramp = scenario.origins == 1  # joins at face 9, past the first off-ramp at face 6
     assert not np.any(scenario.exits[second_ramp] == 0)
 
@@ -56,7 +54,7 @@ def test_arrivals_are_poisson_with_the_declared_rates():
 
 def test_the_streams_are_independent_of_one_another():
     corridor = randomised(PAPER_HIGHWAY)
-    fixed = dataclasses.replace(corridor, incident=Incident(2, ((10, 20, 10),)))
+    fixed = corridor.replaced(incident=Incident(2, ((10, 20, 10),)))
     random_scenario, fixed_scenario = draw_scenario(corridor, 5), draw_scenario(fixed, 5)
     assert random_scenario.incidents != fixed_scenario.incidents
     assert random_scenario.demand == fixed_scenario.demand
@@ -69,7 +67,7 @@ def test_rates_of_a_ramp_and_shares_of_an_exit_follow_their_steps():
         on_ramps=(((0.0, 0.0), (300.0, 20_000.0)), 0.0),
         exit_shares=(((0.0, 0.9), (350.0, 0.1)), ((0.0, 0.5),)),
     )
-    corridor = dataclasses.replace(PAPER_HIGHWAY, demand=demand, incident=None)
+    corridor = PAPER_HIGHWAY.replaced(demand=demand, incident=None)
     scenario = draw_scenario(corridor, 0)
     ramp = scenario.departures[scenario.origins == 0]
     assert ramp.min() > 300.0
@@ -82,7 +80,7 @@ def test_rates_of_a_ramp_and_shares_of_an_exit_follow_their_steps():
 
 
 def test_vehicles_have_classes_by_their_shares_and_else_move_alike():
-    corridor = dataclasses.replace(PAPER_HIGHWAY, vehicle_classes=CLASSES)
+    corridor = PAPER_HIGHWAY.replaced(vehicle_classes=CLASSES)
     scenarios = [draw_scenario(corridor, seed) for seed in range(20)]
     classes = np.concatenate([each.classes for each in scenarios])
     assert classes.mean() == pytest.approx(0.3, abs=0.02)
@@ -97,11 +95,11 @@ def test_vehicles_have_classes_by_their_shares_and_else_move_alike():
 def test_incidents_are_drawn_one_by_one():
     drawn = IncidentDistribution(tuple(range(5)))
     fixed = Incident(7, ((10, 20, 10),))
-    both = dataclasses.replace(PAPER_HIGHWAY, incident=(drawn, fixed, drawn))
-    alone = dataclasses.replace(PAPER_HIGHWAY, incident=drawn)
+    both = PAPER_HIGHWAY.replaced(incident=(drawn, fixed, drawn))
+    alone = PAPER_HIGHWAY.replaced(incident=drawn)
     first, second, third = draw_scenario(both, 3).incidents
     assert first == draw_scenario(alone, 3).incidents[0]
     assert second == fixed
     assert third != first
-    assert dataclasses.replace(both, incident=(drawn,)) == alone
-    assert dataclasses.replace(both, incident=()).incident is None
+    assert both.replaced(incident=(drawn,)) == alone
+    assert both.replaced(incident=()).conditions.incident is None

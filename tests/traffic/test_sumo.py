@@ -1,7 +1,5 @@
 """Simulated traffic: it flows, jams and recovers, and runs in SUMO are closed."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -27,8 +25,8 @@ CLASSES = (
     VehicleClass("car", 0.7),
     VehicleClass("truck", 0.3, length=12.0, largest_speed=60.0, drivers=Drivers("Krauss")),
 )
-ROAD = dataclasses.replace(
-    UNEVEN, duration=240, incident=Incident(5, ((60.0, 120.0, 10.0), (120.0, 140.0, 40.0)))
+ROAD = UNEVEN.replaced(
+    duration=240, incident=Incident(5, ((60.0, 120.0, 10.0), (120.0, 140.0, 40.0)))
 )
 
 
@@ -44,15 +42,18 @@ def uneven():
 
 def route(corridor, origin, end):
     """Columns of a vehicle, from its origin to its end."""
-    s = corridor.n_segments
+    s = corridor.geometry.n_segments
     entry, first = [s], 0
     if origin != MAINLINE:
-        entry = [s + 2 + origin, *corridor.on_ramp_segments[origin]]
-        first = corridor.on_ramps[origin]
-    leave, last = [s + 1], corridor.n_mainline
+        entry = [s + 2 + origin, *corridor.geometry.on_ramp_segments[origin]]
+        first = corridor.geometry.on_ramps[origin]
+    leave, last = [s + 1], corridor.geometry.n_mainline
     if end != MAINLINE:
-        leave = [*corridor.off_ramp_segments[end], s + 2 + corridor.n_on_ramps + end]
-        last = corridor.off_ramps[end]
+        leave = [
+            *corridor.geometry.off_ramp_segments[end],
+            s + 2 + corridor.geometry.n_on_ramps + end,
+        ]
+        last = corridor.geometry.off_ramps[end]
     return [*entry, *range(first, last), *leave]
 
 
@@ -83,7 +84,7 @@ def outflow(record, column, start, end):
 
 
 def test_traffic_flows_jams_and_recovers(paper_records):
-    n, incident = PAPER_HIGHWAY.n_mainline, PAPER_HIGHWAY.incident.segment
+    n, incident = PAPER_HIGHWAY.geometry.n_mainline, PAPER_HIGHWAY.conditions.incident.segment
     for record in paper_records:
         assert 85 < mean_speed(record, slice(30, 200), slice(0, n)) < 105
         assert 85 < mean_speed(record, slice(30, 200), slice(n, n + 4)) < 105
@@ -126,7 +127,7 @@ def test_the_same_seed_gives_the_same_record_silently_and_other_drivers_another(
     assert_same(simulate(SHORT_HIGHWAY, 0), short_record)
     assert capfd.readouterr() == ("", "")
     assert short_record.counts[0].sum() == 0
-    record = simulate(dataclasses.replace(SHORT_HIGHWAY, drivers=Drivers("IDM")), 0)
+    record = simulate(SHORT_HIGHWAY.replaced(drivers=Drivers("IDM")), 0)
     assert len(record.speed) > 0
     assert not np.array_equal(record.speed_sums, short_record.speed_sums)
 
@@ -135,7 +136,9 @@ def test_the_same_seed_gives_the_same_record_silently_and_other_drivers_another(
 @pytest.mark.parametrize("corridor", CORRIDORS.values(), ids=CORRIDORS)
 def test_the_presets_dwell_is_that_of_seeds_0_to_15(corridor):
     records = [simulate(corridor, seed) for seed in range(16)]
-    assert average_dwell(corridor, records) == pytest.approx(corridor.average_dwell, abs=0.005)
+    assert average_dwell(corridor, records) == pytest.approx(
+        corridor.scales.average_dwell, abs=0.005
+    )
 
 
 def test_a_run_is_closed_however_it_ends():
@@ -167,7 +170,7 @@ def test_another_release_series_is_refused(monkeypatch):
 
 
 def test_sumo_has_the_lengths_speeds_and_models_of_the_classes():
-    corridor = dataclasses.replace(SHORT_HIGHWAY, vehicle_classes=CLASSES)
+    corridor = SHORT_HIGHWAY.replaced(vehicle_classes=CLASSES)
     scenario = draw_scenario(corridor, 0)
     seen, fastest = set(), np.zeros(2)
     with running(corridor, scenario) as libsumo:

@@ -1,6 +1,5 @@
 """Networks for SUMO: those that come with the package, and compiled ones."""
 
-import dataclasses
 import importlib.util
 import re
 
@@ -8,7 +7,6 @@ import pytest
 
 from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY
 from dptse_env.traffic.sumo_input import (
-    Geometry,
     compile_network,
     edge_ids,
     network_xml,
@@ -25,13 +23,13 @@ needs_netconvert = pytest.mark.skipif(
 @needs_netconvert
 @pytest.mark.parametrize("name", CORRIDORS)
 def test_packaged_networks_are_what_netconvert_makes_of_the_presets(name):
-    assert compile_network(Geometry.from_corridor(CORRIDORS[name])) == packaged_network(name)
+    assert compile_network(CORRIDORS[name].geometry) == packaged_network(name)
 
 
 def test_a_preset_is_not_compiled(monkeypatch):
     monkeypatch.setattr("dptse_env.traffic.sumo_input.compile_network", None)
-    changed = dataclasses.replace(PAPER_HIGHWAY, name="mine", incident=None, duration=60)
-    assert network_xml(changed) == packaged_network("paper-highway")
+    changed = PAPER_HIGHWAY.replaced(name="mine", incident=None, duration=60)
+    assert network_xml(changed.geometry) == packaged_network("paper-highway")
 
 
 def test_a_missing_netconvert_names_the_extra(monkeypatch):
@@ -42,15 +40,16 @@ def test_a_missing_netconvert_names_the_extra(monkeypatch):
 
     monkeypatch.setattr(importlib.util, "find_spec", without_sumo)
     with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[corridors\]'"):
-        compile_network(Geometry.from_corridor(PAPER_HIGHWAY)._replace(n_mainline=21))
+        compile_network(PAPER_HIGHWAY.replaced(n_mainline=21).geometry)
 
 
 def test_the_network_has_the_lengths_lanes_and_limits_of_the_corridor():
-    text = network_xml(UNEVEN)
-    lengths = UNEVEN.with_boundaries(UNEVEN.segment_lengths)
-    lanes = UNEVEN.with_boundaries(UNEVEN.segment_lanes)
-    limits = UNEVEN.with_boundaries(UNEVEN.speed_limits)
-    for edge, length, count, limit in zip(edge_ids(UNEVEN), lengths, lanes, limits, strict=True):
+    road = UNEVEN.geometry
+    text = network_xml(road)
+    lengths = road.with_boundaries(road.segment_lengths)
+    lanes = road.with_boundaries(road.segment_lanes)
+    limits = road.with_boundaries(road.speed_limits)
+    for edge, length, count, limit in zip(edge_ids(road), lengths, lanes, limits, strict=True):
         found = re.findall(
             rf'<lane id="{edge}_\d+" index="\d+" .*?speed="([\d.]+)" length="([\d.]+)"', text
         )

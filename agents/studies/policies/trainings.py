@@ -118,7 +118,7 @@ def fits(setting: str, learner: str) -> bool:
     env, keywords = SETTINGS[setting].env, SETTINGS[setting].keywords
     with quietly():
         config = make_config(env, keywords)
-    return parse_algorithm(LEARNERS[learner][0], config.corridor.n_mainline).fits(config)
+    return parse_algorithm(LEARNERS[learner][0], config.corridor.geometry.n_mainline).fits(config)
 
 
 def plan_of(training: Training, study: Path, minutes: float) -> TrainingPlan:
@@ -134,7 +134,7 @@ def plan_of(training: Training, study: Path, minutes: float) -> TrainingPlan:
     if learner in (START, STARTED):
         minutes /= 2
     with quietly():
-        n_segments = make_config(setting.env, setting.keywords).corridor.n_mainline
+        n_segments = make_config(setting.env, setting.keywords).corridor.geometry.n_mainline
     given = {**setting.changes.get(name, {}), **own}
     algorithm = parse_algorithm(f"{name} {json.dumps(given)}", n_segments)
     return TrainingPlan(

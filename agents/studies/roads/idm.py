@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dptse_env.traffic import Corridor, Demand
+from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Scales
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.roads import DENSITY_SCALE
 from dptse_env.utils.arrays import AnyArray, FloatArray
 
 LANES, LIMIT = 3, 105.0
@@ -38,12 +37,9 @@ CHANGE = 0.05
 
 def road() -> Corridor:
     """Return the section that is recorded, without its records."""
-    return Corridor(
-        name="idm", n_mainline=N, on_ramps=(), off_ramps=(), exit_shares=(),
-        demand=Demand(mainline=((0.0, 4500.0),)), incident=None, fixed_sensors=(),
-        duration=DURATION, lanes=LANES, segment_length=WIDTH / 1000.0, speed_limit=LIMIT,
-        density_scale=DENSITY_SCALE * LANES, speed_scale=LIMIT,
-    )  # fmt: skip
+    geometry = Geometry(N, lanes=LANES, segment_length=WIDTH / 1000.0, speed_limit=LIMIT)
+    conditions = Conditions(Demand(mainline=((0.0, 4500.0),)), DURATION)
+    return Corridor("idm", geometry, conditions, Scales.of(geometry, average_dwell=8.0))
 
 
 def simulate(seed: int) -> Record:

@@ -6,7 +6,6 @@ the other simulator, ``"agents.studies.roads.recorded:section_10003"`` the secti
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -36,7 +35,7 @@ def idm() -> Corridor:
         road = measure(simulator.road(), lambda: records)
         sources = [{"seed": seed} for seed in IDM_SEEDS]
         kept = save_records(folder, road, records, sources)
-        write_corridor(folder / ROAD, dataclasses.replace(road, recordings=kept))
+        write_corridor(folder / ROAD, road.replaced(recordings=kept))
 
     return _made_once(f"idm-{file_digest(simulator.__file__)[:16]}", write)
 
@@ -75,10 +74,10 @@ def section(number: int) -> Corridor:
         with tempfile.TemporaryDirectory() as work:
             cut = Section(number, SEGMENTS, windows=1, seconds=SECONDS)
             road = read_corridor(cut.write(Path(work), RecordLibrary()))
-            assert road.recordings is not None
-            record = load_record(road.recordings, 0, road.record_layout)
+            assert road.source.recordings is not None
+            record = load_record(road.source.recordings, 0, road.record_layout)
         kept = save_records(folder, road, [record], [{"seed": number}])
-        write_corridor(folder / ROAD, dataclasses.replace(road, recordings=kept))
+        write_corridor(folder / ROAD, road.replaced(recordings=kept))
 
     return _made_once(f"section-{number}-{file_digest(highways.__file__)[:16]}", write)
 
@@ -86,10 +85,11 @@ def section(number: int) -> Corridor:
 def queue_of(road: Corridor, record: Record) -> str | None:
     """Return where a section has a queue, one of `QUEUES`; None where that is not clear."""
     lengths, limits = (
-        np.array(road.with_boundaries(each)) for each in (road.segment_lengths, road.speed_limits)
+        np.array(road.geometry.with_boundaries(each))
+        for each in (road.geometry.segment_lengths, road.geometry.speed_limits)
     )
     slow = (record.traffic(lengths, limits)[..., 1] < SLOW * limits).mean(axis=0)
-    mainline, (start, end) = slow[: road.n_mainline], slow[road.n_segments :][:2]
+    mainline, (start, end) = slow[: road.geometry.n_mainline], slow[road.geometry.n_segments :][:2]
     if min(mainline[-1], end) > QUEUED:
         return "queue through the end"
     if mainline.max() > QUEUED and end < RARELY:

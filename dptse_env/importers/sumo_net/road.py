@@ -12,12 +12,12 @@ import numpy as np
 from dptse_env.importers.measured import with_measured
 from dptse_env.importers.sumo_net.configuration import Files
 from dptse_env.importers.sumo_net.segmentation import Segmentation
-from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.corridor import Conditions, Corridor, Scales, Source
 from dptse_env.traffic.demand import Demand, Profile
+from dptse_env.traffic.geometry import Geometry
 from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.recording import simulate_in_worker
-from dptse_env.traffic.roads import DENSITY_SCALE
 from dptse_env.traffic.sumo import RecordingError
 from dptse_env.utils.arrays import BoolArray, IntArray
 from dptse_env.utils.fields import require
@@ -85,7 +85,7 @@ def import_road(
     except RecordingError as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"net: {files.net}: SUMO refuses these files: {reason:.500}") from error
-    if not (record.segment < draft.n_mainline).any():
+    if not (record.segment < draft.geometry.n_mainline).any():
         seen = f"{record.n_vehicles} on its ramps or ends" if record.n_rows else "none"
         routes = ", ".join(path.name for path in files.routes)
         raise ValueError(
@@ -96,11 +96,11 @@ def import_road(
     first = np.full((record.n_vehicles, record.n_columns), NEVER)
     np.minimum.at(first, (record.vehicle, record.segment), record.step.astype(np.int64))
     corridor = with_measured(draft, [record], _demand(draft, first), _exit_shares(draft, first))
-    inside = (first.argmin(axis=1) < draft.n_mainline) & (first.min(axis=1) > 0)
+    inside = (first.argmin(axis=1) < draft.geometry.n_mainline) & (first.min(axis=1) > 0)
     if inside.any():
         share = f"{inside.sum()} of {record.n_vehicles} vehicles"
         remarks.append(f"{share} appear on the mainline, past every entrance")
-    if not record.counts[0, : draft.n_mainline].any():
+    if not record.counts[0, : draft.geometry.n_mainline].any():
         remarks.append("the record begins on an empty mainline; a warm-up fills it")
     remarks += [f"no vehicle {text}" for text in _unused(draft, segments.names, first)]
     remarks.append(
@@ -112,7 +112,8 @@ def import_road(
 
 def _unused(corridor: Corridor, names: Sequence[str], first: IntArray) -> Iterator[str]:
     """Yield the entrances and exits that no vehicle takes, for people."""
-    N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
+    road = corridor.geometry
+    N, S, n_on = road.n_mainline, road.n_segments, road.n_on_ramps
     ends = ["enters at the upstream end", "leaves at the downstream end"]
     ramps = [f"{'enters by' if i < n_on else 'leaves by'} {name}" for i, name in enumerate(names)]
     for i, text in enumerate([*ends, *ramps]):
@@ -153,25 +154,26 @@ def _draft(
         tuple(round(each if speed_limit is None else speed_limit, 1) for each in of_edges)
         for of_edges in (segments.limits, segments.ramp_limits)
     )
-    return Corridor(
-        name=name,
+    geometry = Geometry(
         n_mainline=N,
         on_ramps=segments.on_ramps,
         off_ramps=segments.off_ramps,
         exit_shares=(0.5,) * n_off,
-        demand=Demand(mainline=((0.0, 0.0),), on_ramps=(0.0,) * n_on),
-        incident=None,
-        fixed_sensors=(N - 1, *(N + n_on + i for i in range(n_off))),
-        duration=duration,
         lanes=segments.lanes,
         ramp_lanes=segments.ramp_lanes or 1,
         segment_length=_kilometres(segments.lengths),
         speed_limit=limits,
         ramp_length=_kilometres(segments.ramp_lengths) or None,
         ramp_speed_limit=ramp_limits or None,
-        density_scale=DENSITY_SCALE * max(segments.lanes),
-        speed_scale=max(limits),
-        network=network,
+    )
+    demand = Demand(mainline=((0.0, 0.0),), on_ramps=(0.0,) * n_on)
+    return Corridor(
+        name=name,
+        geometry=geometry,
+        conditions=Conditions(demand, duration),
+        scales=Scales.of(geometry),
+        source=Source(network=network),
+        fixed_sensors=(N - 1, *(N + n_on + i for i in range(n_off))),
     )
 
 
@@ -185,8 +187,9 @@ def _demand(corridor: Corridor, first: IntArray) -> Demand:
     Vehicles that are there at second 0 have entered before. Rates hold for a quarter of a record,
     one minute at least and five at most.
     """
-    period = max(60, min(300, corridor.duration // 4))
-    times = np.append(np.arange(0, corridor.duration, period), corridor.duration)
+    duration = corridor.conditions.duration
+    period = max(60, min(300, duration // 4))
+    times = np.append(np.arange(0, duration, period), duration)
     if len(times) > 2 and times[-1] - times[-2] < period:
         times = np.delete(times, -2)  # a last step that is shorter joins the one before
 
@@ -196,7 +199,8 @@ def _demand(corridor: Corridor, first: IntArray) -> Demand:
         pairs = zip(times[:-1], hourly, strict=True)
         return tuple((float(time), round(float(rate), 1)) for time, rate in pairs)
 
-    N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
+    road = corridor.geometry
+    N, S, n_on = road.n_mainline, road.n_segments, road.n_on_ramps
     ramps = [np.minimum(first[:, N + i], first[:, S + 2 + i]) for i in range(n_on)]
     return Demand(mainline=rates(first[:, S]), on_ramps=tuple(map(rates, ramps)))
 
@@ -208,8 +212,9 @@ def _exit_shares(corridor: Corridor, first: IntArray) -> Iterator[float]:
         found: BoolArray = np.any(first[:, columns] < NEVER, axis=1)
         return found
 
-    N, S, n_on = corridor.n_mainline, corridor.n_segments, corridor.n_on_ramps
-    for i, face in enumerate(corridor.off_ramps):
+    road = corridor.geometry
+    N, S, n_on = road.n_mainline, road.n_segments, road.n_on_ramps
+    for i, face in enumerate(road.off_ramps):
         left = reached(N + n_on + i, S + 2 + n_on + i)
         passed = reached(S, *range(face)) & reached(*range(face, N), S + 1) & ~left
         yield left.sum() / max((left | passed).sum(), 1)

@@ -13,7 +13,7 @@ def record():
     for vehicle in range(12):
         place, speed = generator.uniform(0.0, 1.0), generator.uniform(10.0, 90.0)
         for step in range(1 + 2 * vehicle, HORIZON + 1):
-            if place < ROAD.n_mainline:
+            if place < ROAD.geometry.n_mainline:
                 rows.append((step, vehicle, int(place), speed))
             place += speed / 100.0 * generator.uniform(0.1, 1.0)
             speed = float(np.clip(speed + generator.normal(0.0, 10.0), 0.0, 120.0))

@@ -14,10 +14,10 @@ from dptse_env.release import RELEASE_MODELS
 from dptse_env.traffic import SHORT_HIGHWAY, Demand
 
 HORIZON = 40
-ROAD = dataclasses.replace(
-    SHORT_HIGHWAY, duration=HORIZON, demand=Demand(((0.0, 1000.0),), (100.0,)), incident=None
+ROAD = SHORT_HIGHWAY.replaced(
+    duration=HORIZON, demand=Demand(((0.0, 1000.0),), (100.0,)), incident=None
 )
-N_COLUMNS = ROAD.n_segments + ROAD.n_boundaries
+N_COLUMNS = ROAD.geometry.n_segments + ROAD.geometry.n_boundaries
 SECONDS = np.arange(1, HORIZON + 1)
 
 
@@ -41,7 +41,7 @@ class HalfTheLimit(OpenLoop):
 
     def estimate(self):
         estimate = super().estimate()
-        speed = np.full_like(estimate.speed, 0.5 * ROAD.speed_limit)
+        speed = np.full_like(estimate.speed, 0.5 * ROAD.geometry.speed_limit)
         return estimate._replace(speed=speed)
 
 

@@ -57,9 +57,14 @@ def sums_in(record, setting, observed, terms):
         if privacy.preset == "paper":
             sums[step - 1, segment] += 1.0, speed
             continue
-        price = (sigma[step - 1, segment, 0] * ROAD.segment_length) ** -2 if is_paced else 1.0
-        grid = grid_of(float(sigma[step - 1, segment, 1] * ROAD.segment_length))
-        d = np.rint((min(speed, ROAD.speed_limit) - centre[step - 1, segment]) / grid) * grid
+        price = (
+            (sigma[step - 1, segment, 0] * ROAD.geometry.segment_length) ** -2 if is_paced else 1.0
+        )
+        grid = grid_of(float(sigma[step - 1, segment, 1] * ROAD.geometry.segment_length))
+        d = (
+            np.rint((min(speed, ROAD.geometry.speed_limit) - centre[step - 1, segment]) / grid)
+            * grid
+        )
         d = min(max(d, -np.floor(clip / grid) * grid), np.floor(clip / grid) * grid)
         cost = price * (1.0 + ratio * (d / clip) ** 2)
         if paid.get(vehicle, 0.0) + cost <= budget:
@@ -67,9 +72,11 @@ def sums_in(record, setting, observed, terms):
             sums[step - 1, segment] += 1.0, d
     if privacy.preset == "paper":
         counts = sums[..., 0]
-        means = np.where(counts > 0, sums[..., 1] / np.maximum(counts, 1.0), ROAD.speed_limit)
-        return np.stack([counts / ROAD.segment_length, means], axis=-1)
-    return sums / ROAD.segment_length
+        means = np.where(
+            counts > 0, sums[..., 1] / np.maximum(counts, 1.0), ROAD.geometry.speed_limit
+        )
+        return np.stack([counts / ROAD.geometry.segment_length, means], axis=-1)
+    return sums / ROAD.geometry.segment_length
 
 
 @pytest.mark.parametrize(
@@ -203,10 +210,10 @@ class AskedTooOften(Capped):
 def test_a_mechanism_of_ones_own_is_caught(mechanism, record):
     setting = config(preset=mechanism, epsilon=5.0, cap=2)
     worlds = AdjacentWorlds(record, (staying(1), staying(3)))
-    everything = np.ones((HORIZON, ROAD.n_mainline), dtype=bool)
-    setting = dataclasses.replace(setting, bandwidth=ROAD.n_mainline)
+    everything = np.ones((HORIZON, ROAD.geometry.n_mainline), dtype=bool)
+    setting = dataclasses.replace(setting, bandwidth=ROAD.geometry.n_mainline)
     assert verdict(setting, worlds, policy=everything) == "rejected"
-    sound = config(ROAD.n_mainline, epsilon=5.0, cap=2)
+    sound = config(ROAD.geometry.n_mainline, epsilon=5.0, cap=2)
     assert verdict(sound, worlds, policy=everything) == "not rejected"
 
 

@@ -12,7 +12,7 @@ from dptse_env.parts import make_task, privacy_report
 
 from .small import ROAD, config, paced
 
-EVERYWHERE = ROAD.n_mainline
+EVERYWHERE = ROAD.geometry.n_mainline
 
 
 @pytest.mark.parametrize("kind", ["elsewhere", "fast", "absent"])

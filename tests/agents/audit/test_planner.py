@@ -29,7 +29,7 @@ def test_moves_are_the_distance_of_a_second(preset, record):
         path = Trajectory.from_record(record, vehicle)
         keep, moved = path.only(path.step != step), path.only(path.step == step)
         rest = AdjacentWorlds(record.without(vehicle), (keep, keep)).get(ROAD, 0)
-        plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
+        plan = np.zeros((HORIZON, ROAD.geometry.n_mainline), dtype=bool)
         plan[step - 1, int(record.segment[row])] = True
         worlds = AdjacentWorlds(rest, (moved, Trajectory.absent()))
         distance = mu * reached(setting, worlds, plan, 1)
@@ -43,7 +43,7 @@ def test_moves_are_the_distance_of_a_second(preset, record):
 def test_where_paths_meet_speeds_alone_tell(preset, record):
     setting = config(preset=preset)
     paths = tuple(Trajectory.constant(np.array([20]), 2, speed) for speed in (5.0, 140.0))
-    plan = np.zeros((HORIZON, ROAD.n_mainline), dtype=bool)
+    plan = np.zeros((HORIZON, ROAD.geometry.n_mainline), dtype=bool)
     plan[19, 2] = True
     distance = reached(setting, AdjacentWorlds(record, paths), plan, 1)
     first, second = (Planner(setting).moves(record, path)[0] for path in paths)
@@ -73,7 +73,7 @@ MORE_CAPPED = [
     config(cap=20, horizon=10),
     config(unit="event"),
     config(cap=500),
-    dataclasses.replace(config(), corridor=dataclasses.replace(ROAD, fixed_sensors=())),
+    dataclasses.replace(config(), corridor=ROAD.replaced(fixed_sensors=())),
 ]
 
 
@@ -99,7 +99,7 @@ def test_opposite_deviations_on_one_segment_are_a_worst_case(record):
         slow, fast = worlds.trajectories
         np.testing.assert_array_equal(slow.segment, fast.segment)
         assert set(slow.speed.tolist()) == {0.0}
-        assert set(fast.speed.tolist()) == {ROAD.speed_limit}
+        assert set(fast.speed.tolist()) == {ROAD.geometry.speed_limit}
         # All that is told is the speed: nobody can tell the counts apart.
         assert np.array_equal(*(worlds.get(ROAD, seed).counts for seed in (0, 1)))
         part = reached(setting, worlds)
@@ -298,4 +298,4 @@ def test_public_schedules_are_those_of_the_environment():
     assert [np.flatnonzero(row).tolist() for row in plan[[0, 3, 4, 8]]] == [
         [0, 3], [0, 3], [1, 4], [2, 5],
     ]  # fmt: skip
-    assert plan.shape == (HORIZON, ROAD.n_mainline)
+    assert plan.shape == (HORIZON, ROAD.geometry.n_mainline)

@@ -74,8 +74,8 @@ def test_squared_errors_are_those_of_density_and_speed_in_units_of_their_scales(
     block = env.unwrapped.interface.observations.block
     estimated = [block(observation, name)[:6] for name in ("density", "speed")]
     corridor, occupied = env.unwrapped.config.corridor, density > 0
-    expected = (estimated[0] - density / corridor.density_scale) ** 2
+    expected = (estimated[0] - density / corridor.scales.density_scale) ** 2
     assert occupied.any()
-    expected += occupied * (estimated[1] - speed / corridor.speed_scale) ** 2
+    expected += occupied * (estimated[1] - speed / corridor.scales.speed_scale) ** 2
     np.testing.assert_allclose(squared[0], expected, rtol=1e-4, atol=1e-8)
     assert squared.shape == (1, 6)

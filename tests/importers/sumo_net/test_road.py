@@ -70,7 +70,7 @@ def test_routes_of_no_use_are_refused(files, tmp_path, content, message):
 def test_every_vehicle_on_the_path_and_its_ramps_is_counted_once(road):
     corridor = road.corridor
     limits = {}
-    for column in corridor.network.columns:
+    for column in corridor.source.network.columns:
         for edge, start, end in column:
             low, high = limits.get(edge, (np.inf, 0.0))
             limits[edge] = min(low, start), max(high, end)
@@ -94,7 +94,7 @@ def test_every_vehicle_on_the_path_and_its_ramps_is_counted_once(road):
 
 def test_vehicles_pass_from_segment_to_segment_without_gaps(road):
     record, corridor = road.record, road.corridor
-    N, S = corridor.n_mainline, corridor.n_segments
+    N, S = corridor.geometry.n_mainline, corridor.geometry.n_segments
     order = np.lexsort((record.step, record.vehicle))
     vehicle, step, column = (
         each[order].astype(int) for each in (record.vehicle, record.step, record.segment)
@@ -103,7 +103,7 @@ def test_vehicles_pass_from_segment_to_segment_without_gaps(road):
     assert set(np.diff(step)[same]) == {1}
     passages = set(zip(column[:-1][same], column[1:][same], strict=True))
     passages = {(here, there) for here, there in passages if here != there}
-    (on,), (off,) = corridor.on_ramps, corridor.off_ramps
+    (on,), (off,) = corridor.geometry.on_ramps, corridor.geometry.off_ramps
     assert passages == {
         *((i, i + 1) for i in range(N - 1)),
         *((S, 0), (N - 1, S + 1)),
@@ -113,7 +113,7 @@ def test_vehicles_pass_from_segment_to_segment_without_gaps(road):
 
 
 def test_the_record_is_that_of_the_generated_network_if_the_files_are_the_same(tmp_path):
-    calm = dataclasses.replace(SHORT_HIGHWAY, incident=None)
+    calm = SHORT_HIGHWAY.replaced(incident=None)
     scenario = draw_scenario(calm, 3)
     network, routes = tmp_path / "short.net.xml", tmp_path / "short.rou.xml"
     network.write_text(packaged_network("short-highway"))
@@ -131,19 +131,20 @@ def test_the_record_is_that_of_the_generated_network_if_the_files_are_the_same(t
         np.testing.assert_array_equal(getattr(road.record, name), getattr(expected, name))
     pairs = set(zip(road.record.vehicle.tolist(), expected.vehicle.tolist(), strict=True))
     assert len(pairs) == len(set(expected.vehicle)) == road.record.n_vehicles
+    found, fields = road.corridor.fields(), calm.fields()
     same = ("n_mainline", "on_ramps", "off_ramps", "fixed_sensors", "lanes", "ramp_lanes")
     for name in (*same, "segment_length", "speed_limit", "density_scale", "speed_scale"):
-        assert getattr(road.corridor, name) == getattr(calm, name), name
+        assert found[name] == fields[name], name
 
 
 def _vehicles(corridor, scenario):
     """Write a scenario of a generated network as SUMO's routes."""
     root = ElementTree.Element("routes")
-    ElementTree.SubElement(root, "vType", {"id": "car", **corridor.drivers.attributes()})
+    ElementTree.SubElement(root, "vType", {"id": "car", **corridor.conditions.drivers.attributes()})
     for i, origin in enumerate(scenario.origins):
         end = scenario.exits[i]
-        first = 0 if origin == MAINLINE else corridor.on_ramps[origin]
-        last = corridor.n_mainline if end == MAINLINE else corridor.off_ramps[end]
+        first = 0 if origin == MAINLINE else corridor.geometry.on_ramps[origin]
+        last = corridor.geometry.n_mainline if end == MAINLINE else corridor.geometry.off_ramps[end]
         start = ["upstream"] if origin == MAINLINE else [f"before_on_{origin}", f"on_{origin}"]
         stop = ["downstream"] if end == MAINLINE else [f"off_{end}", f"after_off_{end}"]
         edges = [*start, *(f"main_{k}" for k in range(first, last)), *stop]
@@ -174,8 +175,8 @@ def test_vehicles_out_of_order_depart_and_what_nobody_takes_is_told(files, tmp_p
 
 
 def test_vehicles_that_do_not_depart_are_told_when_they_are_recorded(road, tmp_path, caplog):
-    crowded = DemandDistribution(road.corridor.published_demand, (6.0, 6.0))
-    corridor = dataclasses.replace(road.corridor, demand=crowded, duration=60)
+    crowded = DemandDistribution(road.corridor.conditions.published_demand, (6.0, 6.0))
+    corridor = road.corridor.replaced(demand=crowded, duration=60)
     RecordLibrary(tmp_path).ensure(corridor, [0, 1])
     (message,) = caplog.messages
     assert re.fullmatch(
@@ -190,7 +191,7 @@ from dptse_env.importers.sumo_net import Files, segment_path, import_road
 from dptse_env.traffic import RecordLibrary, SHORT_HIGHWAY
 files = Files(pathlib.Path("road.net.xml"), (pathlib.Path("road.rou.xml"),))
 road = import_road(files, segment_path(files, sys.argv[1:], 100.0), "road", 30).corridor
-longer = SHORT_HIGHWAY.replaced({"segment_length": 0.15, "duration": 30, "incident": None})
+longer = SHORT_HIGHWAY.replaced(segment_length=0.15, duration=30, incident=None)
 for corridor in (road, SHORT_HIGHWAY, longer):
     print(RecordLibrary("Aufzeichnungen für mich").get(corridor, 0).n_rows)
 """
@@ -214,13 +215,13 @@ def test_letters_beyond_ascii_in_folders_are_of_no_matter(locale, files, tmp_pat
 
 def test_demand_exit_shares_and_dwell_are_counted(road):
     corridor = road.corridor
-    rates = [rate for _, rate in corridor.demand.mainline]
+    rates = [rate for _, rate in corridor.conditions.demand.mainline]
     assert np.mean(rates) == pytest.approx(1800.0, rel=0.1)  # those who leave come along, too
-    on_ramp = [rate for _, rate in corridor.demand.on_ramps[0]]
+    on_ramp = [rate for _, rate in corridor.conditions.demand.on_ramps[0]]
     assert np.mean(on_ramp) == pytest.approx(400.0, rel=0.1)
     # At the off-ramp: 300 of 1500 + 300 + 400 an hour.
-    assert corridor.exit_shares[0] == pytest.approx(300 / 2200, rel=0.3)
-    assert 3.0 < corridor.average_dwell < 6.0
+    assert corridor.geometry.exit_shares[0] == pytest.approx(300 / 2200, rel=0.3)
+    assert 3.0 < corridor.scales.average_dwell < 6.0
     assert corridor.measured == ("demand", "exit_shares", "average_dwell")
     assert road.remarks == (
         "the record begins on an empty mainline; a warm-up fills it",
@@ -230,9 +231,9 @@ def test_demand_exit_shares_and_dwell_are_counted(road):
 
 
 def test_an_incident_slows_the_vehicles_on_its_segment_alone(road):
-    segment = road.corridor.n_mainline - 2
+    segment = road.corridor.geometry.n_mainline - 2
     incident = Incident(segment=segment, phases=((60.0, 120.0, 10.0),))
-    slow = simulate(dataclasses.replace(road.corridor, incident=incident), 0)
+    slow = simulate(road.corridor.replaced(incident=incident), 0)
     here = (slow.segment == segment) & (slow.step > 80) & (slow.step <= 120)
     assert slow.speed[here].mean() < 20.0
     assert slow.speed[here].max() < 90.0
@@ -246,7 +247,7 @@ def test_an_incident_slows_the_vehicles_on_its_segment_alone(road):
 
 def test_a_warm_up_starts_the_record_with_traffic(files, road):
     warm = imported(files, warm_up=120)
-    assert warm.corridor.network.begin == 120
+    assert warm.corridor.source.network.begin == 120
     assert road.record.counts[0].sum() == 0
     np.testing.assert_array_equal(warm.record.counts[0], road.record.counts[120])
 
@@ -255,10 +256,8 @@ def test_an_incident_makes_no_vehicle_faster(files, road, tmp_path):
     slow = tmp_path / "slow.rou.xml"
     slow.write_text(FLOWS.replace('id="car"', 'id="car" maxSpeed="10"'))
     digests = file_digest(files.net), file_digest(slow)
-    network = dataclasses.replace(road.corridor.network, routes=(str(slow),), sha256=digests)
-    limited = dataclasses.replace(
-        road.corridor, network=network, incident=Incident(2, ((30, 200, 90.0),))
-    )
+    network = dataclasses.replace(road.corridor.source.network, routes=(str(slow),), sha256=digests)
+    limited = road.corridor.replaced(network=network, incident=Incident(2, ((30, 200, 90.0),)))
     assert 30.0 < simulate(limited, 0).speed.max() <= 36.01
 
 
@@ -267,8 +266,8 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
     folder.mkdir()
     for path in (files.net, *files.routes):
         shutil.copy(path, folder)
-    network = dataclasses.replace(road.corridor.network, folder=str(folder))
-    corridor = dataclasses.replace(road.corridor, network=network)
+    network = dataclasses.replace(road.corridor.source.network, folder=str(folder))
+    corridor = road.corridor.replaced(network=network)
     write_corridor(folder / "road.toml", corridor)
     assert str(tmp_path) not in (folder / "road.toml").read_text()
     assert read_corridor(folder / "road.toml") == corridor
@@ -281,12 +280,12 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
     write_corridor(tmp_path / "link.toml", corridor, {"bandwidth": 3})
     assert (read_corridor(below), "bandwidth" in below.read_text()) == (corridor, True)
     moved = read_corridor(folder.rename(there) / "road.toml")
-    assert Path(moved.network.folder) == there
+    assert Path(moved.source.network.folder) == there
     assert moved.digest == road.corridor.digest
     np.testing.assert_array_equal(simulate(moved, 0).counts, road.record.counts)
-    published = dataclasses.replace(moved, demand=moved.demand.scaled(2.0), lanes=4)
+    published = moved.replaced(demand=moved.conditions.demand.scaled(2.0), lanes=4)
     assert published.digest == road.corridor.digest  # the vehicles are those of the files
-    assert dataclasses.replace(moved, duration=241).digest != road.corridor.digest
+    assert moved.replaced(duration=241).digest != road.corridor.digest
     routes = there / "road.rou.xml"
     routes.write_text(routes.read_text().replace("1500", "1600"))
     with pytest.raises(RecordingError, match=r"road\.rou\.xml: is not the file that the road was"):
@@ -297,7 +296,7 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
 
 
 def test_scenarios_and_corridors_of_no_use_are_refused(road):
-    network = road.corridor.network
+    network = road.corridor.source.network
     for change, message in (
         ({"options": ("--fcd-output=all.xml",)}, "options must be options that change the traffic"),
         ({"options": ("-v",)}, "options must be --name=value each"),
@@ -310,9 +309,9 @@ def test_scenarios_and_corridors_of_no_use_are_refused(road):
             dataclasses.replace(network, **change)
     columns = network.columns[:-1]
     with pytest.raises(ValueError, match=r"corridor\.network\.columns must be one for each of the"):
-        dataclasses.replace(road.corridor, network=dataclasses.replace(network, columns=columns))
+        road.corridor.replaced(network=dataclasses.replace(network, columns=columns))
     with pytest.raises(ValueError, match=r"corridor\.drivers must be left out"):
-        dataclasses.replace(road.corridor, drivers=Drivers("IDM"))
+        road.corridor.replaced(drivers=Drivers("IDM"))
 
 
 WRITERS = """

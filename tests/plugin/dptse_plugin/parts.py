@@ -16,7 +16,7 @@ from dptse_env.spaces.actions import ActionEncoding, Decision
 from dptse_env.traffic import SHORT_HIGHWAY
 from dptse_env.utils.fields import Interval, checked_fields
 
-ROAD = dataclasses.replace(SHORT_HIGHWAY, name="plugin-road", fixed_sensors=(0, 5))
+ROAD = SHORT_HIGHWAY.replaced(name="plugin-road", fixed_sensors=(0, 5))
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class LaplaceRelease(ReleaseModel):
 
 def cheap_queries(second: Any) -> Any:
     """Minus the density error, and a price for each query."""
-    error = second.error.density / second.corridor.density_scale
+    error = second.error.density / second.corridor.scales.density_scale
     return -error - 0.01 * second.queried.sum(axis=1)
 
 
@@ -104,7 +104,9 @@ class MeanDensity:
         return 1
 
     def values(self, state: Any, task: Any) -> Any:
-        return state.estimate.density.mean(axis=1, keepdims=True) / task.corridor.density_scale
+        return (
+            state.estimate.density.mean(axis=1, keepdims=True) / task.corridor.scales.density_scale
+        )
 
 
 class Neighbours(ActionEncoding):
