@@ -15,16 +15,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate, Estimator, Measurement
+from dptse_env.estimators.base import Estimate, KernelEstimator
 from dptse_env.estimators.recurrent_kernels import (
     CHANNELS,
     LONGEST_AGE,
     Memory,
     Network,
-    advance,
+    State,
     make_cells,
-    read,
+    predict,
+    restart,
     shapes,
+    update,
 )
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.simple import estimated_traffic
@@ -44,7 +46,7 @@ SHIPPED = ("highway", "long-highway", "roads")
 _FOLDER, _SUFFIX = Path(__file__).parent / "networks", ".safetensors"
 
 
-class Recurrent(Estimator):
+class Recurrent(KernelEstimator):
     """A gated recurrent unit in every cell of the road.
 
     All cells share the weights and see the releases that cover them, the predictions of the second
@@ -57,9 +59,10 @@ class Recurrent(Estimator):
         hidden: Hidden states, shape (n, S, H).
     """
 
-    is_compiled: ClassVar[bool] = True
     has_demand: ClassVar[bool] = False
     steps_model: ClassVar[bool] = False
+    predict_kernel = staticmethod(predict)
+    update_kernel = staticmethod(update)
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
@@ -67,15 +70,26 @@ class Recurrent(Estimator):
         flows = model.centre is not None
         self.saved = network_for(settings.recurrent.weights, model.road, flows)
         S, n = model.n_segments, n_episodes
-        self.hidden = np.zeros((n, S, self.saved.network.width), dtype=np.float32)
-        self._present, self._ahead, self._prior = np.zeros((3, n, S, 4))
-        self._age = np.full((n, S), LONGEST_AGE)
-        self._inputs = np.zeros((n, model.n_inputs))
-        deviation = np.sqrt(settings.initial_variance)
-        spread = deviation * np.array([model.density_scale, model.speed_scale])
-        self._present[..., 2:] = self._prior[..., 2:] = spread
-        memory = Memory(self._inputs, self._present, self._age, self.innovations)
-        self._bundle = Bundle(model.road, model.channels, make_cells(model), memory)
+        self._memory = Memory(
+            inputs=np.zeros((n, model.n_inputs)),
+            present=np.zeros((n, S, 4)),
+            age=np.full((n, S), LONGEST_AGE),
+            innovations=self.innovations,
+        )
+        self._state = State(
+            hidden=np.zeros((n, S, self.saved.network.width), dtype=np.float32),
+            ahead=np.zeros((n, S, 4)),
+            priors=np.zeros((n, S, 4)),
+            diverged=self.diverged,
+        )
+        scale = np.array([model.density_scale, model.speed_scale])
+        self._state.priors[..., 2:] = np.sqrt(settings.initial_variance) * scale
+        self._memory.present[:] = self._state.priors
+        self.hidden = self._state.hidden
+        self.arrays = Bundle(
+            model.road, model.channels, make_cells(model), self._memory, self.saved.network,
+            self._state,
+        )  # fmt: skip
 
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
@@ -102,41 +116,17 @@ class Recurrent(Estimator):
     @property
     def means(self) -> FloatArray:
         """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
-        return self._present[..., :2]
+        return self._memory.present[..., :2]
 
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
         density, speed = estimated_traffic(self.model, states[:, : 2 * self.model.n_segments])
-        self._prior[episodes, :, 0], self._prior[episodes, :, 1] = density, speed
-        self._restart(episodes)
-
-    def _restart(self, episodes: IntArray) -> None:
-        self.hidden[episodes] = 0.0
-        self._present[episodes] = self._ahead[episodes] = self._prior[episodes]
-        self._age[episodes] = LONGEST_AGE
-        self.innovations[episodes] = 0.0
-
-    def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
-        self._present[episodes] = self._ahead[episodes]
-        self._inputs[episodes] = inputs
-
-    def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        network = self.saved.network
-        shape = episodes.size, self.model.n_segments, len(network.inputs)
-        x = np.empty(shape, dtype=np.float32)
-        read(self._bundle, episodes, measured, x)
-        advance(self._bundle, network, episodes, x, self.hidden, self._ahead)
-        # Gates hold what is not finite to their range: the state does not show it.
-        sound = np.all(np.isfinite(measured.values) | ~measured.observed[..., None], axis=(1, 2))
-        sound &= np.isfinite(self._inputs[episodes]).all(axis=1)
-        sound &= np.isfinite(self.hidden[episodes]).all(axis=(1, 2))
-        self.diverged[episodes] = ~sound
-        if not sound.all():
-            self._restart(episodes[~sound])
+        self._state.priors[episodes, :, 0], self._state.priors[episodes, :, 1] = density, speed
+        restart(self.arrays, episodes)
 
     def _estimate(self) -> Estimate:
-        return Estimate(*(self._present[..., j].copy() for j in range(4)))
+        return Estimate(*(self._memory.present[..., j].copy() for j in range(4)))
 
 
 def outside(saved: SavedNetwork, road: Road, flows: bool, largest_span: int) -> list[str]:

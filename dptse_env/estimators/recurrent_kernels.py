@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 from dptse_env.estimators.base import Measurement
 from dptse_env.model import ARZModel
 from dptse_env.model.step import clip
-from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.kernels import Bundle, inline_part, kernel, kernel_part
+from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import Bundle, all_finite, inline_part, kernel, kernel_part
 
 Float32Array = NDArray[np.float32]
 
@@ -151,23 +151,72 @@ class Memory(NamedTuple):
     innovations: FloatArray  # (n, M, 2)
 
 
+class State(NamedTuple):
+    """State of a network in n episodes."""
+
+    hidden: Float32Array  # (n, S, H)
+    ahead: FloatArray  # (n, S, 4) `Memory.present` of the next second before its release
+    priors: FloatArray  # (n, S, 4) likewise, of the first second
+    diverged: BoolArray  # (n,)
+
+
+@kernel
+def restart(bundle: Bundle, episodes: IntArray) -> None:
+    """Begin episodes `(k,)` with their priors."""
+    _, _, _, memory, _, state = bundle.parts
+    for e in episodes:
+        _restart(memory, state, e)
+
+
+@kernel_part
+def _restart(memory: Memory, state: State, e: int) -> None:
+    state.hidden[e] = 0.0
+    memory.present[e] = state.priors[e]
+    state.ahead[e] = state.priors[e]
+    memory.age[e] = LONGEST_AGE
+    memory.innovations[e] = 0.0
+
+
+@kernel
+def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
+    """Take what was estimated of the next second, and keep the inputs `(k, n_u)`."""
+    _, _, _, memory, _, state = bundle.parts
+    for k in range(episodes.size):
+        memory.present[episodes[k]] = state.ahead[episodes[k]]
+        memory.inputs[episodes[k]] = inputs[k]
+
+
+@kernel
+def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
+    """Advance the network by what was released of episodes `(k,)`."""
+    road, _, _, memory, network, state = bundle.parts
+    x = np.empty((episodes.size, road.n_segments, network.inputs.shape[0]), np.float32)
+    read(bundle, episodes, measured, x)
+    advance(bundle, episodes, x)
+    for k in range(episodes.size):
+        e = episodes[k]
+        # Gates hold what is not finite to their range: the hidden state does not show it.
+        sound = all_finite(memory.inputs[e]) and all_finite(state.hidden[e].reshape(-1))
+        for m in range(measured.observed.shape[1]):
+            sound = sound and (not measured.observed[k, m] or all_finite(measured.values[k, m]))
+        state.diverged[e] = not sound
+        if not sound:
+            _restart(memory, state, e)
+
+
 @kernel
 def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Array) -> None:
     """Write the network's inputs of all cells, and innovations; count the age of measurements on.
 
     Args:
-        bundle: Road, channels, `Cells` and `Memory`, whose age and innovations are updated.
+        bundle: Road, channels, `Cells` and `Memory`, whose age and innovations are updated; more
+            parts may follow.
         episodes: Shape (k,).
         measured: The release of the k episodes.
         x: Output, shape (k, S, `N_CHANNELS` or more).
     """
-    road, channels, cells, memory = bundle.parts
-    inputs, present, age, innovations = (
-        memory.inputs,
-        memory.present,
-        memory.age,
-        memory.innovations,
-    )
+    road, channels, cells, memory = bundle.parts[:4]
+    inputs, present, age, innovations = memory
     S = road.n_segments
     sums, second = np.empty((S, 10)), np.empty((S, 4))
     outside = np.empty((S, 2))
@@ -281,26 +330,16 @@ def _correction(value: float) -> float:
 
 
 @kernel
-def advance(
-    bundle: Bundle,
-    network: Network,
-    episodes: IntArray,
-    x: Float32Array,
-    hidden: Float32Array,
-    ahead: FloatArray,
-) -> None:
+def advance(bundle: Bundle, episodes: IntArray, x: Float32Array) -> None:
     """Advance the hidden states, and write what the heads read from them.
 
     Args:
-        bundle: Road, channels, `Cells` and `Memory`, whose estimates of this second are updated.
-        network: The weights.
+        bundle: Road, channels, `Cells`, `Memory`, `Network` and `State`.
         episodes: Shape (k,).
         x: Shape (k, S, C + 2 M): the channels, and space for sums of messages.
-        hidden: Hidden states, shape (n, S, H), updated.
-        ahead: Estimates of the next second before its release, shape (n, S, 4), updated.
     """
-    road, _, cells, memory = bundle.parts
-    present = memory.present
+    road, _, cells, memory, network, state = bundle.parts
+    present, hidden, ahead = memory.present, state.hidden, state.ahead
     S, H = road.n_segments, network.hidden.shape[0]
     M = (network.inputs.shape[0] - N_CHANNELS) // 2
     g, q = np.empty((S, 3 * H), dtype=np.float32), np.empty((S, 3 * H), dtype=np.float32)
