@@ -114,11 +114,8 @@ class Registry(Mapping[str, Any]):
             )
         if value not in self._parts and ":" not in value:
             load_plugins()
-        if value not in self._parts and ":" not in value:
-            raise ValueError(
-                f"{self.keyword} must be one of {', '.join(self._parts)}, or, outside of files, "
-                f"'package.module:Name', got {shown(value)}"
-            )
+            names = f"one of {', '.join(self._parts)}, or, outside of files, 'package.module:Name'"
+            require(value in self._parts, self.keyword, names, value)
         return value
 
     def _imported(self, path: str) -> Any:
