@@ -75,7 +75,7 @@ class Road:
     @property
     def inherited(self) -> str:
         """Name of the ARZ parameters that the environment has where nobody gives any."""
-        return str(PRESETS[preset_of(self.env)].parameters)
+        return PRESETS[preset_of(self.env)].parameters.name
 
     @property
     def all_seeds(self) -> tuple[int, ...]:
