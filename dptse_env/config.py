@@ -17,7 +17,6 @@ from dptse_env.estimators import (
     Estimator,
     check_estimator,
     checked_settings,
-    settings_type,
 )
 from dptse_env.estimators.tuned import (
     read_settings,
@@ -361,7 +360,7 @@ def _settings(
     tuned = _tuned(estimator, parameters, privacy, corridor)
     if isinstance(value, Mapping):
         base = checked_settings(estimator, tuned)
-        value = from_mapping(settings_type(estimator), value, path, base)
+        value = from_mapping(ESTIMATORS.find(estimator).settings_type, value, path, base)
     elif isinstance(value, str) and value.endswith(".json"):
         value = read_settings(value)
     checked_settings(estimator, tuned if value is None else value)

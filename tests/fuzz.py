@@ -41,7 +41,7 @@ import dptse_env
 from agents.policies import find_policy
 from dptse_env import config
 from dptse_env.config import EnvConfig
-from dptse_env.estimators import ESTIMATORS, settings_type
+from dptse_env.estimators import ESTIMATORS
 from dptse_env.estimators.tuned import available_settings, load_settings, write_settings
 from dptse_env.importers import Layout, Source, import_trajectories
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
@@ -173,7 +173,7 @@ def keyword(name, rng, given):
         case "estimator_settings":
             estimator = given.get("estimator")
             known = estimator if estimator in NAMES["estimator"] else "ekf"
-            return some_fields(settings_type(known), rng, 0.02)
+            return some_fields(ESTIMATORS.find(known).settings_type, rng, 0.02)
         case "observation":
             return [one_of(["default", *BLOCKS], rng) for _ in range(rng.integers(1, 4))]
         case "privacy":

@@ -41,7 +41,6 @@ __all__ = [
     "checked_settings",
     "make_estimator",
     "require_time_step",
-    "settings_type",
 ]
 
 
@@ -158,7 +157,7 @@ def make_estimator(
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
     check_estimator(estimator, backend)
-    settings = settings_type(estimator)() if settings is None else settings
+    settings = ESTIMATORS.find(estimator).settings_type() if settings is None else settings
     check_settings(estimator, model, settings)
     reference = backend == "reference"
     part: Any = resolve_name(REFERENCES[estimator]) if reference else ESTIMATORS.find(estimator)
@@ -168,12 +167,6 @@ def make_estimator(
     return made
 
 
-def settings_type(estimator: Any) -> type:
-    """Return the dataclass of an estimator's settings."""
-    cls: type = ESTIMATORS.find(estimator).settings_type
-    return cls
-
-
 def checked_settings(estimator: Any, settings: Any) -> Any:
     """Return an estimator's settings, by name, as they are, or the defaults in place of None.
 
@@ -181,7 +174,7 @@ def checked_settings(estimator: Any, settings: Any) -> Any:
         ValueError: There are none of this name, they are of another type, or the estimator has no
             demand states, which they ask for.
     """
-    expected = settings_type(estimator)
+    expected = ESTIMATORS.find(estimator).settings_type
     if isinstance(settings, str):
         settings = load_settings(settings)
     elif settings is None:
