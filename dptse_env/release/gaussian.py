@@ -57,6 +57,8 @@ class GaussianRelease(ReleaseModel):
         noise: Standard normal noise.
     """
 
+    void_reasons: ClassVar[tuple[str, ...]] = ()
+    """Reasons for which the sensitivity or the noise gives no guarantee."""
     knows_groups: ClassVar[bool] = True
     takes_noise: ClassVar[bool] = True
 
@@ -98,10 +100,6 @@ class GaussianRelease(ReleaseModel):
     @abstractmethod
     def _noise_std(self, group: int) -> tuple[float, ...]:
         """Return the standard deviations of the noise that `sensitivity` needs in a group."""
-
-    @abstractmethod
-    def _void_reasons(self) -> tuple[str, ...]:
-        """Return the reasons for which the sensitivity or the noise gives no guarantee."""
 
     @abstractmethod
     def true_values(self, request: Request) -> FloatArray:
@@ -155,7 +153,7 @@ class GaussianRelease(ReleaseModel):
         task, settings, sensitivity = self.task, self.task.settings, self.sensitivity[0]
         mu = self._account.mu
         epsilon = epsilon_of(mu, settings.delta)
-        found = list(self._void_reasons())
+        found = list(self.void_reasons)
         # Le Ny's kappa may be so loose that even both releases together stay below epsilon.
         if epsilon > settings.epsilon * (1.0 + 1e-9):
             found.append("releases_not_composed")
@@ -205,6 +203,10 @@ class Paper(GaussianRelease):
     Where a group of columns does not see all vehicles, of those that it sees.
     """
 
+    void_reasons: ClassVar[tuple[str, ...]] = (
+        "literal_variance", "average_dwell", "adaptive_queries", "speed_sensitivity",
+    )  # fmt: skip
+
     def __init__(self, task: Task, traffic: Traffic) -> None:
         """See `GaussianRelease`."""
         super().__init__(task, traffic)
@@ -227,9 +229,6 @@ class Paper(GaussianRelease):
     def _noise_std(self, group: int) -> tuple[float, ...]:
         settings = self.task.settings
         return printed_noise_std(self.sensitivity[group], settings.epsilon, settings.delta)
-
-    def _void_reasons(self) -> tuple[str, ...]:
-        return ("literal_variance", "average_dwell", "adaptive_queries", "speed_sensitivity")
 
     def true_values(self, request: Request) -> FloatArray:
         """See `GaussianRelease.true_values`."""
@@ -256,12 +255,11 @@ class Paper(GaussianRelease):
 class Corrected(Paper):
     """The same as `Paper`, with the noise that the theorem cited there needs, per release."""
 
+    void_reasons: ClassVar[tuple[str, ...]] = Paper.void_reasons[1:]
+
     def _noise_std(self, group: int) -> tuple[float, ...]:
         settings = self.task.settings
         return single_noise_std(self.sensitivity[group], settings.epsilon, settings.delta)
-
-    def _void_reasons(self) -> tuple[str, ...]:
-        return super()._void_reasons()[1:]
 
 
 @dataclass(frozen=True)
@@ -347,9 +345,6 @@ class Capped(GaussianRelease):
         noise = joint_noise_std(sensitivity, settings.epsilon, settings.delta, settings.share)
         factor = (1.0 + ROUNDING) / math.sqrt(self.task.shares[group])
         return tuple(factor * std for std in noise)
-
-    def _void_reasons(self) -> tuple[str, ...]:
-        return ()
 
     @property
     def protected(self) -> str:
