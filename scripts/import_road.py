@@ -299,27 +299,27 @@ def print_next(
 
 def describe(road: ImportedRoad) -> str:
     """Describe a road of a network in a few lines."""
-    corridor, segments, network = road.corridor, road.segments, road.corridor.source.network
+    corridor, names = road.corridor, road.segments.names
+    geometry, network = corridor.geometry, corridor.source.network
     assert network is not None
-    on, off = (
-        segments.names[: corridor.geometry.n_on_ramps],
-        segments.names[corridor.geometry.n_on_ramps :],
+    n, n_on = geometry.n_mainline, geometry.n_on_ramps
+    lengths, lanes, limits = (
+        each[:n]
+        for each in (geometry.segment_lengths, geometry.segment_lanes, geometry.speed_limits)
     )
-    lengths = segments.lengths
     demand = corridor.conditions.published_demand
     lines = [
         f"{corridor.name}: from {Path(network.net).name}, seconds {network.begin} to "
         f"{network.begin + corridor.conditions.duration}",
-        f"{corridor.geometry.n_mainline} segments of {min(lengths):.0f} to {max(lengths):.0f} m, "
-        f"{min(segments.lanes)} to {max(segments.lanes)} lanes, "
-        f"{min(segments.limits):.0f} to {max(segments.limits):.0f} km/h",
+        f"{n} segments of {1000 * min(lengths):.0f} to {1000 * max(lengths):.0f} m, "
+        f"{min(lanes)} to {max(lanes)} lanes, {min(limits):.0f} to {max(limits):.0f} km/h",
         f"mainline: {_range(demand.mainline)}",
     ]
-    for face, name, rates in zip(corridor.geometry.on_ramps, on, demand.ramp_profiles, strict=True):
+    on_ramps = zip(geometry.on_ramps, names[:n_on], demand.ramp_profiles, strict=True)
+    for face, name, rates in on_ramps:
         lines.append(f"on-ramp at face {face}: {name}, {_range(rates)}")
-    for face, name, share in zip(
-        corridor.geometry.off_ramps, off, corridor.geometry.exit_shares, strict=True
-    ):
+    off_ramps = zip(geometry.off_ramps, names[n_on:], geometry.exit_shares, strict=True)
+    for face, name, share in off_ramps:
         lines.append(f"off-ramp at face {face}: {name}, {100 * share:.1f} % leave")
     lines += [f"note: {remark}" for remark in road.remarks]
     return "\n".join(lines)

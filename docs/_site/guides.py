@@ -48,7 +48,7 @@ def draw_network(net: Path, segments: Segmentation) -> Figure:
             axis.plot(
                 *np.array(lane.getShape()).T, color=GRID_COLOUR, lw=2.5, solid_capstyle="butt"
             )
-    n, n_ramps = len(segments.lengths), len(segments.names)
+    n, n_ramps = segments.geometry.n_mainline, segments.geometry.n_ramps
     colours = [MAINLINE[number % 2] for number in range(n)] + [RAMP] * n_ramps
     colours += [BOUNDARY] * (2 + n_ramps)
     for number, (stretches, colour) in enumerate(zip(segments.columns, colours, strict=True)):

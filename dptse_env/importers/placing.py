@@ -27,9 +27,9 @@ class Branches:
 
     def __init__(self, corridor: Corridor) -> None:
         """Lay the columns along the road."""
-        self.corridor = corridor
-        n, first = corridor.geometry.n_mainline, corridor.geometry.n_segments
-        lengths = np.array(corridor.geometry.with_boundaries(corridor.geometry.segment_lengths))
+        self.corridor, road = corridor, corridor.geometry
+        n, first = road.n_mainline, road.n_segments
+        lengths = corridor.road.lengths
         self.faces = np.concatenate([[0.0], np.cumsum(lengths[:n])])
         start, end = -lengths[first], self.faces[-1] + lengths[first + 1]
         self.starts: list[FloatArray] = []
@@ -37,22 +37,18 @@ class Branches:
         self.columns: list[IntArray] = []
         """Columns of each branch."""
         self._add([start, *self.faces, end], [first, *range(n), first + 1])
-        boundary = itertools.count(first + 2)
-        for face, segments in zip(
-            corridor.geometry.on_ramps, corridor.geometry.on_ramp_segments, strict=True
-        ):
-            ramp = [next(boundary), *segments]
-            before = self.faces[face] - np.cumsum(lengths[ramp][::-1])[::-1]
-            starts = [*before, *self.faces[face:], end]
-            self._add(starts, [*ramp, *range(face, n), first + 1])
-        for face, segments in zip(
-            corridor.geometry.off_ramps, corridor.geometry.off_ramp_segments, strict=True
-        ):
-            ramp = [*segments, next(boundary)]
-            after = self.faces[face] + np.cumsum(lengths[ramp])
-            starts = [start, *self.faces[: face + 1], *after]
-            self._add(starts, [first, *range(face), *ramp])
-        self.n_branches = 1 + corridor.geometry.n_ramps
+        for number, (face, _, segments) in enumerate(road.ramps()):
+            boundary = first + 2 + number
+            if number < road.n_on_ramps:
+                ramp = [boundary, *segments]
+                before = self.faces[face] - np.cumsum(lengths[ramp][::-1])[::-1]
+                starts = [*before, *self.faces[face:], end]
+                self._add(starts, [*ramp, *range(face, n), first + 1])
+            else:
+                ramp = [*segments, boundary]
+                after = self.faces[face] + np.cumsum(lengths[ramp])
+                starts = [start, *self.faces[: face + 1], *after]
+                self._add(starts, [first, *range(face), *ramp])
 
     def _add(self, starts: list[float], columns: list[int]) -> None:
         self.starts.append(np.array(starts))
@@ -61,21 +57,21 @@ class Branches:
     @property
     def column_starts(self) -> tuple[NDArray[np.int16], FloatArray]:
         """Branch of each record column, and the position at which it starts [km]."""
-        n_columns = self.corridor.geometry.n_segments + self.corridor.geometry.n_boundaries
+        n_columns = self.corridor.record_shape[1]
         branch, start = np.zeros(n_columns, dtype=np.int16), np.zeros(n_columns)
-        for number in reversed(range(self.n_branches)):
-            columns = self.columns[number][:-1]
+        for number, of_branch in reversed([*enumerate(self.columns)]):
+            columns = of_branch[:-1]
             branch[columns], start[columns] = number, self.starts[number][:-1]
         return branch, start
 
     def column(self, branch: NDArray[np.int16], position: FloatArray) -> NDArray[np.int16]:
         """Return the record column at positions of branches, or `OFF`, shape (n,)."""
         found = np.full(len(position), OFF, dtype=np.int16)
-        for number in range(self.n_branches):
+        for number, (starts, columns) in enumerate(zip(self.starts, self.columns, strict=True)):
             here = branch == number
             if here.any():
-                place = np.searchsorted(self.starts[number], position[here], side="right") - 1
-                found[here] = self.columns[number][place]  # -1, before the first, is OFF
+                place = np.searchsorted(starts, position[here], side="right") - 1
+                found[here] = columns[place]  # -1, before the first, is OFF
         return found
 
 

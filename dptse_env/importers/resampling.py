@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Mapping
 
@@ -335,17 +334,15 @@ def count_ends(
     pieces: pl.DataFrame, coverage: Mapping[str, tuple[float, float]], branches: Branches
 ) -> Counter[str]:
     """Count where the pieces of trajectories begin and end: at an entry, or amid the road."""
-    road = branches.corridor
-    n, first, n_on = road.geometry.n_mainline, road.geometry.n_segments, road.geometry.n_on_ramps
-    before = range(first + 2, first + 2 + n_on)
-    after = range(first + 2 + n_on, first + 2 + road.geometry.n_ramps)
-    entries = [0, first, *itertools.chain(*road.geometry.on_ramp_segments), *before]
-    exits = [n - 1, first + 1, *itertools.chain(*road.geometry.off_ramp_segments), *after]
+    road = branches.corridor.road
     first_time, last_time = (
         pl.col("group").replace_strict({g: c[i] for g, c in coverage.items()}) for i in (0, 1)
     )
     at_start, at_end = pl.col("begin") < first_time + 1.0, pl.col("end") > last_time - 1.0
-    enters, leaves = pl.col("enters").is_in(entries), pl.col("leaves").is_in(exits)
+    enters, leaves = (
+        pl.col("enters").is_in(np.append(road.entries, road.entry_cells)),
+        pl.col("leaves").is_in(np.append(road.exits, road.exit_cells)),
+    )
     told = pieces.select(
         present_at_start=at_start.sum(), entered=(enters & ~at_start).sum(),
         appeared=(~enters & ~at_start).sum(), present_at_end=at_end.sum(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,6 @@ from dptse_env.importers.sumo_net.configuration import Files
 from dptse_env.importers.sumo_net.segmentation import Segmentation
 from dptse_env.traffic.corridor import Conditions, Corridor, Scales, Source
 from dptse_env.traffic.demand import Demand, Profile
-from dptse_env.traffic.geometry import Geometry
 from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.recording import simulate_in_worker
@@ -149,36 +149,18 @@ def _draft(
         step_length=files.step_length,
         options=files.options,
     )
-    N, n_on, n_off = map(len, (segments.lengths, segments.on_ramps, segments.off_ramps))
-    limits, ramp_limits = (
-        tuple(round(each if speed_limit is None else speed_limit, 1) for each in of_edges)
-        for of_edges in (segments.limits, segments.ramp_limits)
-    )
-    geometry = Geometry(
-        n_mainline=N,
-        on_ramps=segments.on_ramps,
-        off_ramps=segments.off_ramps,
-        exit_shares=(0.5,) * n_off,
-        lanes=segments.lanes,
-        ramp_lanes=segments.ramp_lanes or 1,
-        segment_length=_kilometres(segments.lengths),
-        speed_limit=limits,
-        ramp_length=_kilometres(segments.ramp_lengths) or None,
-        ramp_speed_limit=ramp_limits or None,
-    )
-    demand = Demand(mainline=((0.0, 0.0),), on_ramps=(0.0,) * n_on)
+    road = segments.geometry
+    if speed_limit is not None:
+        road = dataclasses.replace(road, speed_limit=speed_limit, ramp_speed_limit=None)
+    N, n_on, n_off = road.n_mainline, road.n_on_ramps, road.n_off_ramps
     return Corridor(
         name=name,
-        geometry=geometry,
-        conditions=Conditions(demand, duration),
-        scales=Scales.of(geometry),
+        geometry=road,
+        conditions=Conditions(Demand(((0.0, 0.0),), (0.0,) * n_on), duration),
+        scales=Scales.of(road),
         source=Source(network=network),
         fixed_sensors=(N - 1, *(N + n_on + i for i in range(n_off))),
     )
-
-
-def _kilometres(lengths: Sequence[float]) -> tuple[float, ...]:
-    return tuple(round(length / 1000.0, 4) for length in lengths)
 
 
 def _demand(corridor: Corridor, first: IntArray) -> Demand:

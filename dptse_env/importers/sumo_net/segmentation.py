@@ -19,6 +19,7 @@ from dptse_env.importers.sumo_net.net import (
     successors,
 )
 from dptse_env.model.parameters import load_parameters
+from dptse_env.traffic.geometry import Geometry
 from dptse_env.traffic.own_sumo import TOLERANCE, Stretch
 from dptse_env.utils.fields import require, shown
 
@@ -40,28 +41,14 @@ class Segmentation:
     """Segments of a road, and their stretches of edges in the net.
 
     Attributes:
-        lengths: (N,) length of each mainline segment [m].
-        lanes: (N,) lanes of each mainline segment.
-        limits: (N,) speed limit of each mainline segment [km/h].
-        on_ramps: face of each on-ramp.
-        off_ramps: face of each off-ramp.
-        ramp_lengths: length of each ramp [m], on-ramps first; its boundary segment is as long.
-        ramp_lanes: lanes of each ramp, on-ramps first, at most those of the segment that it joins
-            or leaves.
-        ramp_limits: speed limit of each ramp [km/h], on-ramps first.
+        geometry: the segments, with exit shares of a half. The boundary segment of a ramp is as
+            long as its segment.
         columns: stretches of each record column.
         names: edges of each ramp at the path, on-ramps first.
         remarks: sentences for people on what is unusual.
     """
 
-    lengths: tuple[float, ...]
-    lanes: tuple[int, ...]
-    limits: tuple[float, ...]
-    on_ramps: tuple[int, ...]
-    off_ramps: tuple[int, ...]
-    ramp_lengths: tuple[float, ...]
-    ramp_lanes: tuple[int, ...]
-    ramp_limits: tuple[float, ...]
+    geometry: Geometry
     columns: tuple[tuple[Stretch, ...], ...]
     names: tuple[str, ...]
     remarks: tuple[str, ...]
@@ -115,21 +102,36 @@ def segment_path(
     sides = list(zip(ramps, faces, lengths, strict=True))
     if left_out:
         merged.append(f"left out: {', '.join(left_out)}; vehicles that take them appear and vanish")
+    try:
+        geometry = Geometry(
+            n_mainline=len(parts),
+            on_ramps=tuple(face for ramp, face, _ in sides if ramp.joins),
+            off_ramps=tuple(face for ramp, face, _ in sides if not ramp.joins),
+            exit_shares=(0.5,) * sum(not ramp.joins for ramp in ramps),
+            lanes=lanes,
+            ramp_lanes=tuple(
+                min(ramp.lanes(length), lanes[face - (not ramp.joins)])
+                for ramp, face, length in sides
+            )
+            or 1,
+            segment_length=tuple(_kilometres(end - start) for start, end in parts),
+            speed_limit=tuple(round(chain.limit(start, end), 1) for start, end in parts),
+            ramp_length=tuple(map(_kilometres, lengths)) or None,
+            ramp_speed_limit=tuple(round(ramp.limit(length), 1) for ramp, _, length in sides)
+            or None,
+        )
+    except ValueError as problem:
+        raise ValueError(f"net: {files.net}: {problem}") from problem
     return Segmentation(
-        lengths=tuple(end - start for start, end in parts),
-        lanes=lanes,
-        limits=tuple(chain.limit(start, end) for start, end in parts),
-        on_ramps=tuple(face for ramp, face, _ in sides if ramp.joins),
-        off_ramps=tuple(face for ramp, face, _ in sides if not ramp.joins),
-        ramp_lengths=tuple(lengths),
-        ramp_lanes=tuple(
-            min(ramp.lanes(length), lanes[face - (not ramp.joins)]) for ramp, face, length in sides
-        ),
-        ramp_limits=tuple(ramp.limit(length) for ramp, _, length in sides),
-        columns=_columns(chain, cuts, sides),
-        names=tuple(" + ".join(ramp.names) for ramp in ramps),
-        remarks=(*net.remarks(edges), *merged),
+        geometry,
+        _columns(chain, cuts, sides),
+        tuple(" + ".join(ramp.names) for ramp in ramps),
+        (*net.remarks(edges), *merged),
     )
+
+
+def _kilometres(length: float) -> float:
+    return round(length / 1000.0, 4)
 
 
 # Distances along edges ------------------------------------------------------------------------

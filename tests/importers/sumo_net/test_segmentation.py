@@ -19,8 +19,7 @@ def lengths_of_edges(network):
 def test_segments_cover_the_path_without_gaps(files):
     segments = segment_path(files, PATH, 100.0)
     edges = lengths_of_edges(files.net)
-    S = len(segments.lengths) + 2
-    columns = segments.columns
+    S, columns = segments.geometry.n_segments, segments.columns
     on_path = [*columns[S : S + 1], *columns[: S - 2], columns[S + 1]]
     stretches = [stretch for column in on_path for stretch in column]
     for name in PATH:
@@ -30,36 +29,39 @@ def test_segments_cover_the_path_without_gaps(files):
         assert all(end == start for (_, end), (start, _) in pairwise(parts))
     internal = {edge for edge, _, _ in stretches if edge.startswith(":")}
     assert len(internal) == 5  # four junctions along the path, and one way out of it
-    total = sum(segments.lengths) + 2 * segments.lengths[0]
+    lengths = segments.geometry.segment_lengths
+    total = 1000 * (sum(lengths[:-2]) + 2 * lengths[0])
     crossings = sum(edges[edge] for edge in internal)
     assert total == pytest.approx(sum(edges[name] for name in PATH) + crossings, rel=0.02)
 
 
 def test_ramps_lie_at_faces_and_acceleration_lanes_count_as_lanes_of_the_mainline(files):
     segments, longer = (segment_path(files, PATH, length) for length in (100.0, 150.0))
-    (on,), (off,) = segments.on_ramps, segments.off_ramps
+    road = segments.geometry
+    (on,), (off,) = road.on_ramps, road.off_ramps
     assert on == 3  # 400 m before the junction are four parts, the first of them the boundary
     assert segments.names == ("ramp-b", "exit-a")
-    between = segments.lengths[on:off]
-    assert between == pytest.approx([between[0]] * len(between))
-    assert 90.0 < between[0] < 110.0
-    assert segments.ramp_lengths == pytest.approx((100.0, 100.0))
-    assert segments.lanes[:on] == (2,) * on
+    between = road.segment_lengths[on:off]
+    assert between == pytest.approx([between[0]] * len(between), abs=1e-4)
+    assert 0.09 < between[0] < 0.11
+    assert road.segment_lengths[-2:] == (0.1, 0.1)
+    assert road.segment_lanes[:on] == (2,) * on
     # 250 m: two segments, and less than half of one
-    assert segments.lanes[on : on + 2] == (3, 3)
-    assert set(segments.lanes[on + 3 :]) == {2}
-    assert longer.lanes[longer.on_ramps[0] + 1] == 3  # two thirds of it
-    assert segments.limits[0] == pytest.approx(108.0)
-    assert segments.limits[-1] == pytest.approx(90.0)
+    assert road.segment_lanes[on : on + 2] == (3, 3)
+    assert set(road.segment_lanes[on + 3 : -2]) == {2}
+    assert longer.geometry.segment_lanes[longer.geometry.on_ramps[0] + 1] == 3  # two thirds of it
+    assert road.speed_limits[0] == 108.0
+    assert road.speed_limits[road.n_mainline - 1] == 90.0
     # Ramps of several edges go on behind a boundary inside an edge.
-    ramp, before = longer.columns[len(longer.lengths)], longer.columns[-2]
+    ramp, before = longer.columns[longer.geometry.n_mainline], longer.columns[-2]
     assert {edge for edge, _, _ in ramp if not edge.startswith(":")} == {"ramp-b"}
     assert {edge for edge, _, _ in before if not edge.startswith(":")} == {"ramp-b", "ramp-a"}
     part = segment_path(files, PATH, 100.0, ends=(150.0, 300.0))
-    assert len(part.lengths) < len(segments.lengths)
-    (upstream,) = part.columns[len(part.lengths) + 2]
+    n = part.geometry.n_mainline
+    assert n < road.n_mainline
+    (upstream,) = part.columns[n + 2]
     assert upstream[:2] == ("in", 150.0)
-    assert part.columns[len(part.lengths) + 3][-1] == ("out", pytest.approx(200.0, abs=5.0), 300.0)
+    assert part.columns[n + 3][-1] == ("out", pytest.approx(200.0, abs=5.0), 300.0)
 
 
 def test_roads_that_meet_at_one_junction_are_one_ramp(tmp_path):
@@ -72,8 +74,8 @@ def test_roads_that_meet_at_one_junction_are_one_ramp(tmp_path):
     )
     segments = segment_path(Files(netconvert(tmp_path, NODES, edges, connections), ()), PATH, 100.0)
     assert segments.names[0] == "ramp-b + second"
-    assert segments.ramp_lanes == (2, 1)
-    columns = segments.columns[len(segments.lengths)]
+    assert segments.geometry.ramp_lanes == (2, 1)
+    columns = segments.columns[segments.geometry.n_mainline]
     assert {"ramp-b", "second"} <= {edge for edge, _, _ in columns}
 
 
@@ -91,7 +93,7 @@ def test_a_lay_by_is_an_off_ramp_and_an_on_ramp_on_either_half(tmp_path):
     network = netconvert(tmp_path, NODES, edges, connections)
     segments = segment_path(Files(network, ()), PATH, 100.0)
     assert segments.names == ("ramp-b", "lay-by", "lay-by", "exit-a")
-    N = len(segments.lengths)
+    N = segments.geometry.n_mainline
     joining, leaving = segments.columns[N + 1], segments.columns[N + 2]
     assert leaving[0][:2] == ("lay-by", 0.0)
     assert joining[0][1] > leaving[0][2] + 100.0  # the two boundary segments lie between them
