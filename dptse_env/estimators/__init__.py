@@ -3,7 +3,7 @@
 from pkgutil import resolve_name
 from typing import Any, get_args
 
-from dptse_env.estimators.base import Backend, Estimate, Estimator, Measurement
+from dptse_env.estimators.base import Backend, Estimate, Estimator, KernelEstimator, Measurement
 from dptse_env.estimators.settings import (
     AdaptiveSmoothingSettings,
     BlendSettings,
@@ -32,6 +32,7 @@ __all__ = [
     "Estimator",
     "EstimatorSettings",
     "HorizonSettings",
+    "KernelEstimator",
     "Measurement",
     "MixtureSettings",
     "RecurrentSettings",

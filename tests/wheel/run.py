@@ -154,7 +154,7 @@ def run_tests(installed: Installed, wheel: Path, source: Path) -> None:
     """Run the fast tests of the source archive, with all extras that they use."""
     call(installed.python, "-m", "pip", "uninstall", "--yes", "dptse-plugin", cwd=installed.folder)
     installed.install(
-        f"{wheel}[train,corridors,ray,video]",
+        f"{wheel}[train,corridors,ray,reference,video]",
         "dp-accounting",
         "hatchling",
         "hypothesis",
