@@ -1,6 +1,6 @@
 """The geometry of a road as arrays, made of a `Geometry` once, for all that computes on it.
 
-Its cells are the S segments, in the order of `dptse_env.traffic.geometry`, then the R boundary
+Its cells are the S segments, in the order of `dptse_env.geometry`, then the R boundary
 segments around them: upstream and downstream of the mainline, before each on-ramp, after each
 off-ramp.
 
@@ -11,10 +11,11 @@ flows into as well (MERGE), into two segments (DIVERGE), or out of the road (EXI
 from __future__ import annotations
 
 import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from dptse_env.geometry import Geometry
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 LINK, MERGE, DIVERGE, EXIT = 0, 1, 2, 3
@@ -67,12 +68,15 @@ class Road(NamedTuple):
         return self
 
 
-def make_road(geometry: Any) -> Road:
+def make_road(geometry: Geometry) -> Road:
     """Return the arrays of a geometry."""
     n, on, off = geometry.n_mainline, geometry.on_ramp_segments, geometry.off_ramp_segments
     S, n_on, n_off = geometry.n_segments, len(on), len(off)
-    lengths = np.array(geometry.with_boundaries(geometry.segment_lengths), dtype=np.float64)
     beside = np.array(geometry.boundary_neighbours, dtype=np.int64)
+    lengths, lanes, limits = (
+        np.append(values, np.array(values)[beside]).astype(np.float64)
+        for values in (geometry.segment_lengths, geometry.segment_lanes, geometry.speed_limits)
+    )
 
     kind, share = np.full(S, EXIT, dtype=np.int64), np.zeros(S)
     parties = np.full((S, 3), -1, dtype=np.int64)
@@ -116,8 +120,8 @@ def make_road(geometry: Any) -> Road:
         n_mainline=n,
         n_segments=S,
         lengths=lengths,
-        lanes=np.array(geometry.with_boundaries(geometry.segment_lanes), dtype=np.float64),
-        limits=np.array(geometry.with_boundaries(geometry.speed_limits), dtype=np.float64),
+        lanes=lanes,
+        limits=limits,
         beside=beside,
         stretch=stretch,
         position=position,

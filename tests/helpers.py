@@ -301,16 +301,8 @@ class Stretch:
         return (self.segment_length,) * self.n_segments
 
     @property
-    def boundary_lanes(self) -> tuple[int, ...]:
-        inside = (self.segment_lanes[s] for s in self.boundary_neighbours)
-        return tuple(lanes + self.more_outside for lanes in inside)
-
-    @property
     def speed_limits(self) -> tuple[float, ...]:
         return (self.speed_limit,) * self.n_segments
-
-    def with_boundaries(self, values: Sequence[Any]) -> tuple[Any, ...]:
-        return (*values, *(values[s] for s in self.boundary_neighbours))
 
 
 def make_channels(first: Sequence[int], span: Sequence[int]) -> Channels:

@@ -95,7 +95,7 @@ class Planner:
         self._budget = float(terms.budget[0])
         # Where all seconds cost the same, the number of those that count.
         self._cap = int(min(self._budget, config.horizon_steps))
-        self._limits = np.array(corridor.geometry.with_boundaries(corridor.geometry.speed_limits))
+        self._limits = corridor.road.limits
         # Record columns that are observed without a query.
         boundaries = range(
             corridor.geometry.n_segments,

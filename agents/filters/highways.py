@@ -189,10 +189,7 @@ class Section:
         """Return the first segment and the windows' starts; where there are queues is likelier."""
         rng = np.random.default_rng([78, self.highway, self.segments, self.seed])
         n = highway.geometry.n_mainline
-        lengths, limits = (
-            np.array(highway.geometry.with_boundaries(each))
-            for each in (highway.geometry.segment_lengths, highway.geometry.speed_limits)
-        )
+        lengths, limits = highway.road.lengths, highway.road.limits
         density, speed = np.moveaxis(record.traffic(lengths, limits)[:, :n], -1, 0)
         is_slow, is_empty = speed < SLOW * limits[:n], density.sum(axis=1) == 0.0
 
@@ -279,7 +276,7 @@ def _averaged(road: Corridor, record: Record, seconds: int) -> Record:
     )
     # Sums of a running window leave rests of some 1e-13 where it is empty again.
     least = 0.5 / seconds
-    lengths = np.array(road.geometry.with_boundaries(road.geometry.segment_lengths))
+    lengths = road.road.lengths
     density = np.where(counts < least, 0.0, counts) / lengths
     speed = np.maximum(speeds, 0.0) / np.maximum(counts, least)
     return Record(

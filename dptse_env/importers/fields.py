@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dptse_env.geometry import SHORTEST_SEGMENT, Geometry
 from dptse_env.importers.folder import (
     ROAD,
     Split,
@@ -24,7 +25,6 @@ from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
 from dptse_env.importers.units import odd_unit
 from dptse_env.traffic.corridor import Conditions, Corridor, Scales
 from dptse_env.traffic.demand import Demand
-from dptse_env.traffic.geometry import SHORTEST_SEGMENT, Geometry
 from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.roads import write_corridor

@@ -148,9 +148,9 @@ class Paced(ReleaseModel):
         # No vehicle pays a price above its budget.
         least = 1.0 / math.sqrt(self.budget.max())
         require_exact_sums(np.array([least, self._flow_noise * least]), settings.clip)
-        self._limits = np.array(task.corridor.geometry.speed_limits)
-        n_boundaries = task.n_cells - task.corridor.geometry.n_segments
-        self._neighbours = np.array(task.corridor.geometry.boundary_neighbours)[:n_boundaries]
+        road = task.corridor.road
+        self._limits = road.limits[: road.n_segments]
+        self._neighbours = road.beside[: task.n_cells - road.n_segments]
         self._fallback = np.zeros(n)
         self._refused = np.zeros((n, len(task.groups)), dtype=np.int64)
 

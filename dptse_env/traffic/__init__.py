@@ -3,6 +3,7 @@
 Importing this package does not import libsumo; only making a record does.
 """
 
+from dptse_env.geometry import Geometry
 from dptse_env.traffic.corridor import Conditions, Corridor, Recordings, Scales, Source
 from dptse_env.traffic.demand import (
     Demand,
@@ -12,7 +13,6 @@ from dptse_env.traffic.demand import (
     IncidentDistribution,
     VehicleClass,
 )
-from dptse_env.traffic.geometry import Geometry
 from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
 from dptse_env.traffic.own_sumo import SumoScenario

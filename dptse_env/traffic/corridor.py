@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, Self
 
+from dptse_env.geometry import Geometry
 from dptse_env.road import Road, make_road
 from dptse_env.traffic.demand import (
     Demand,
@@ -21,7 +22,6 @@ from dptse_env.traffic.demand import (
     IncidentDistribution,
     VehicleClass,
 )
-from dptse_env.traffic.geometry import Geometry
 from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.utils.fields import (
     Interval,

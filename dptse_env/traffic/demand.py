@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
+from dptse_env.geometry import Share
 from dptse_env.utils.fields import Interval, checked_fields, require
 
 Rate = Annotated[float, Interval(0, 100_000)]
@@ -21,8 +22,6 @@ Second = Annotated[float, Interval(0, 1e6)]
 """Seconds of simulated time."""
 Profile = tuple[tuple[Second, Rate], ...]
 """Steps (time [s], rate [veh/h]): each rate holds until the next time, the last one to the end."""
-Share = Annotated[float, Interval(0, 1, open_low=True, open_high=True)]
-"""Share of the vehicles that pass an off-ramp."""
 ShareProfile = tuple[tuple[Second, Share], ...]
 """Steps (time [s], share), as in a `Profile`."""
 Factor = Annotated[float, Interval(0, 100, open_low=True)]

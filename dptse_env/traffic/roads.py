@@ -21,9 +21,9 @@ from typing import Any, TypeGuard
 
 import tomli_w
 
+from dptse_env.geometry import Geometry
 from dptse_env.traffic.corridor import Conditions, Corridor, Scales
 from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, IncidentDistribution
-from dptse_env.traffic.geometry import Geometry
 from dptse_env.utils.fields import read_toml, require, within
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.registry import Registry, require_registered

@@ -20,8 +20,8 @@ from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
+from dptse_env.geometry import Geometry
 from dptse_env.traffic.corridor import Corridor
-from dptse_env.traffic.geometry import Geometry
 from dptse_env.traffic.roads import SHIPPED_CORRIDORS
 from dptse_env.traffic.scenario import MAINLINE, Scenario
 from dptse_env.utils.registry import missing_extra

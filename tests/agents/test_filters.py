@@ -148,7 +148,7 @@ def test_a_section_has_the_vehicles_of_its_highway(night, averaged, tmp_path):
     if not averaged:
         np.testing.assert_array_equal(cut.counts, counts)
         return
-    lengths = np.array(road.geometry.with_boundaries(road.geometry.segment_lengths))
+    lengths = road.road.lengths
     around = np.stack([counts[k - 2 : k + 3].mean(axis=0) for k in range(2, 99)])
     np.testing.assert_allclose(cut.field[2:-2, :, 0], around / lengths, atol=1e-9)
 

@@ -96,7 +96,7 @@ def simulate(
     filling = 0.06 + 0.04 * np.sin(2.0 * np.pi * t / 90.0 + phase)
     filling[200:400, :, 0] += 0.06
     filling[200:400, :, 1] += 0.25
-    rho = filling * per_lane * np.array(road.geometry.boundary_lanes)
+    rho = filling * per_lane * road.road.lanes[s:]
     v = v_f * (1.0 - filling**model.parameters.gamma)
     inputs = np.stack([model.boundary_inputs(a, b) for a, b in zip(rho, v, strict=True)])
 

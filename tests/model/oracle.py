@@ -91,7 +91,7 @@ class Oracle:
         per_lane = parameters.jam_density / parameters.lanes
         self.network, self.v_f, self.gamma = network, parameters.free_flow_speed, parameters.gamma
         self.jam = per_lane * np.array(network.segment_lanes)
-        self.outer_jam = per_lane * np.array(network.boundary_lanes)
+        self.outer_jam = per_lane * road.road.lanes[self.jam.size :]
         self.ratio = time_step / 3600.0 / np.array(network.segment_lengths)
         self.pull = time_step / parameters.relaxation_time
 

@@ -99,7 +99,7 @@ def test_an_empty_segment_or_sensor_has_its_own_speed_limit(groups):
     road = short_road(1).replaced(fixed_sensors=(3, 5, 7), ramp_speed_limit=60.0)
     empty = Worlds(stays(0, 0.0, 1, present=False), road=road)
     release = empty.started(PrivacySettings("paper"), groups=groups)
-    every, task = np.array(road.geometry.with_boundaries(road.geometry.speed_limits)), release.task
+    every, task = road.road.limits, release.task
     found = release.true_values(request(1, n_columns=task.n_channels))
     np.testing.assert_array_equal(found[0, :, 1], every[task.channels.first])
     assert {60.0, LIMIT} == set(every)

@@ -53,9 +53,7 @@ def test_an_empty_segment_has_its_own_limit_and_a_density_its_own_length():
     whole = crowd(seed=3, last=n_columns, n_columns=n_columns)
     table = Traffic(road, (0,), Worlds(whole))
     table.load(0)
-    lengths, limits = map(
-        road.geometry.with_boundaries, (road.geometry.segment_lengths, road.geometry.speed_limits)
-    )
+    lengths, limits = road.road.lengths, road.road.limits
     density, speed = np.moveaxis(table.complete(0), -1, 0)
     np.testing.assert_allclose(density * np.array(lengths), whole.counts)
     empty = whole.counts == 0

@@ -44,12 +44,10 @@ def test_a_missing_netconvert_names_the_extra(monkeypatch):
 
 
 def test_the_network_has_the_lengths_lanes_and_limits_of_the_corridor():
-    road = UNEVEN.geometry
+    road, arrays = UNEVEN.geometry, UNEVEN.road
     text = network_xml(road)
-    lengths = road.with_boundaries(road.segment_lengths)
-    lanes = road.with_boundaries(road.segment_lanes)
-    limits = road.with_boundaries(road.speed_limits)
-    for edge, length, count, limit in zip(edge_ids(road), lengths, lanes, limits, strict=True):
+    columns = arrays.lengths, arrays.lanes, arrays.limits
+    for edge, length, count, limit in zip(edge_ids(road), *columns, strict=True):
         found = re.findall(
             rf'<lane id="{edge}_\d+" index="\d+" .*?speed="([\d.]+)" length="([\d.]+)"', text
         )

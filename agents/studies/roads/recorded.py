@@ -11,7 +11,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from filelock import FileLock
 
 from agents.filters import highways
@@ -84,10 +83,7 @@ def section(number: int) -> Corridor:
 
 def queue_of(road: Corridor, record: Record) -> str | None:
     """Return where a section has a queue, one of `QUEUES`; None where that is not clear."""
-    lengths, limits = (
-        np.array(road.geometry.with_boundaries(each))
-        for each in (road.geometry.segment_lengths, road.geometry.speed_limits)
-    )
+    lengths, limits = road.road.lengths, road.road.limits
     slow = (record.traffic(lengths, limits)[..., 1] < SLOW * limits).mean(axis=0)
     mainline, (start, end) = slow[: road.geometry.n_mainline], slow[road.geometry.n_segments :][:2]
     if min(mainline[-1], end) > QUEUED:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dptse_env.geometry import Geometry
 from dptse_env.importers.sumo_net.configuration import Files
 from dptse_env.importers.sumo_net.net import (
     VEHICLE_CLASS,
@@ -19,7 +20,6 @@ from dptse_env.importers.sumo_net.net import (
     successors,
 )
 from dptse_env.model.parameters import load_parameters
-from dptse_env.traffic.geometry import Geometry
 from dptse_env.traffic.own_sumo import TOLERANCE, Stretch
 from dptse_env.utils.fields import require, shown
 

@@ -8,12 +8,11 @@ length, lanes and limit of the segment that it lies next to.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, TypeVar
 
-from dptse_env.traffic.demand import Share
 from dptse_env.utils.fields import Interval, checked_fields, integer, require
 
 T = TypeVar("T")
@@ -29,6 +28,8 @@ Length = Annotated[float, Interval(SHORTEST_SEGMENT, 10)]
 """Length of a segment [km]."""
 SpeedLimit = Annotated[float, Interval(1, 1000)]
 """A speed limit [km/h]."""
+Share = Annotated[float, Interval(0, 1, open_low=True, open_high=True)]
+"""Share of the vehicles that pass an off-ramp."""
 RampSegments = Annotated[int, Interval(1, 100)]
 """Number of segments of a ramp."""
 
@@ -180,15 +181,6 @@ class Geometry:
         before = [segments[0] for segments in self.on_ramp_segments]
         after = [segments[-1] for segments in self.off_ramp_segments]
         return (0, self.n_mainline - 1, *before, *after)
-
-    @property
-    def boundary_lanes(self) -> tuple[int, ...]:
-        """Lanes of each of the R boundary segments."""
-        return tuple(self.segment_lanes[s] for s in self.boundary_neighbours)
-
-    def with_boundaries(self, values: Sequence[T]) -> tuple[T, ...]:
-        """Return values of the S segments, followed by those of the R boundary segments."""
-        return (*values, *(values[s] for s in self.boundary_neighbours))
 
     @property
     def most_lanes(self) -> int:
