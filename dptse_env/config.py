@@ -336,9 +336,12 @@ def _backend(path: str, value: Any, base: Any, estimator: Any) -> str:
 
 def _parameters(path: str, value: Any, _base: Any) -> ARZParameters:
     """Return ARZ parameters: by name, an object, a mapping of all of them, or a JSON file."""
-    if isinstance(value, str):
-        return (read_parameters if value.endswith(".json") else load_parameters)(value)
-    return from_mapping(ARZParameters, value, path)
+    if not isinstance(value, str):
+        return from_mapping(ARZParameters, value, path)
+    if not value.endswith(".json"):
+        return load_parameters(value)
+    with within(f"{path}: "):
+        return read_parameters(value)
 
 
 def _tuned(
@@ -362,7 +365,8 @@ def _settings(
         base = checked_settings(estimator, tuned)
         value = from_mapping(ESTIMATORS.find(estimator).settings_type, value, path, base)
     elif isinstance(value, str) and value.endswith(".json"):
-        value = read_settings(value)
+        with within(f"{path}: "):
+            value = read_settings(value)
     checked_settings(estimator, tuned if value is None else value)
     return value
 
@@ -573,9 +577,10 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         road = read_road(path)
         table = {key: value for key, value in road.environment.items() if key not in overrides}
         estimator = overrides.get("estimator", table.get("estimator", base.estimator))
-        if _is_tuned_for_another(table.get("estimator_settings"), estimator):
-            del table["estimator_settings"]
         origins = {"corridor": f"{path}: ", **dict.fromkeys(table, f"{path}: environment.")}
+        with within(f"{path}: environment.estimator_settings: "):
+            if _is_tuned_for_another(table.get("estimator_settings"), estimator):
+                del table["estimator_settings"]
         values, assumed = {**table, **overrides, "corridor": road.corridor}, road.assumed
     config = EnvConfig(base, origins=origins, **values)
     inherited = _inherited(config, values, assumed)

@@ -139,6 +139,7 @@ def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
         ("epsilon = 0", r"environment\.privacy\.epsilon must be"),
         ('incident = "some"', r"environment\.corridor\.incident must be one of"),
         ('"a\\nb" = 0', r"environment\.a\\nb is unknown"),
+        ('estimator_settings = "x.json"', r"environment\.estimator_settings: .*x\.json cannot be"),
         ("bandwidth = 9", r"environment\.bandwidth must be in 1\.\.8, got 9"),
     ],
 )
