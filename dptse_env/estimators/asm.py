@@ -62,7 +62,7 @@ from dptse_env.model.arrays import ARZ, Channels
 from dptse_env.model.step import pressure
 from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import Bundle, all_finite, kernel, kernel_part
+from dptse_env.utils.kernels import Bundle, all_finite, inline_part, kernel, kernel_part
 from dptse_env.utils.units import HOUR
 
 REACH = 3.0
@@ -254,7 +254,7 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
         _evaluate(road, arz, stencil, state, e)
 
 
-@kernel_part
+@inline_part
 def _read_ends(
     road: Road,
     arz: ARZ,
@@ -336,7 +336,7 @@ def _sum(stencil: Stencil, past: FloatArray, place: int, sums: FloatArray) -> No
             out[4] += f[1, 0] * now[4] + f[1, 1] * o + f[1, 2] * old[4]
 
 
-@kernel_part
+@inline_part
 def _evaluate(road: Road, arz: ARZ, stencil: Stencil, state: State, e: int) -> None:
     """Write the estimates of an episode, and their deviations."""
     sums, present, smoothed = state.sums[e], state.present[e], state.smoothed[e]
@@ -403,7 +403,7 @@ def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
             _restart(road, state, e)
 
 
-@kernel_part
+@inline_part
 def _read_channel(
     road: Road,
     channels: Channels,

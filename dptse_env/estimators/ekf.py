@@ -34,6 +34,7 @@ from dptse_env.utils.kernels import (
     any_of,
     copy_vector,
     fill_vector,
+    inline_part,
     kernel,
     kernel_part,
 )
@@ -173,7 +174,7 @@ def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
             restart(filters, e)
 
 
-@kernel_part
+@inline_part
 def _linearise(
     arz: ARZ,
     channels: Channels,
@@ -204,7 +205,7 @@ def _linearise(
         linear.noise[m, 1] = (sigma[m, 1] / arz.second_scale) ** 2
 
 
-@kernel_part
+@inline_part
 def _innovate(
     channels: Channels, filters: Filters, e: int, observed: BoolArray, linear: Linearised
 ) -> None:

@@ -90,7 +90,10 @@ def kernel_part(function: Any = None, /, **options: Any) -> Any:
 
 
 def inline_part(function: Function) -> Function:
-    """Let kernels call a function whose body takes the place of each call."""
+    """Let kernels call a function whose body takes the place of each call.
+
+    It saves passing named tuples of many arrays, which go one by one: 0.1 us for a road.
+    """
     return cast("Function", njit(error_model="numpy", inline="always")(function))
 
 
