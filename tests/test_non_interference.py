@@ -89,11 +89,8 @@ def public(env, info):
     estimate = {name: rows.copy() for name, rows in process.estimate._asdict().items()}
     masks = {"released": process.released.copy(), "age": process.age.copy()}
     shown = {key: value for key, value in info.items() if key not in TRUTH_INFO}
-    terms = {
-        name: getattr(process.release, name).copy()
-        for name in ("prices", "centre", "sigmas")
-        if hasattr(process.release, name)
-    }
+    held = vars(process.release)
+    terms = {name: held[name].copy() for name in ("prices", "centre", "sigmas") if name in held}
     return shown | estimate | masks | terms
 
 
