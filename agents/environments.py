@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from dptse_env.config import EnvConfig
 from dptse_env.env import SensorQueryEnv
 from dptse_env.evaluation import require_in_step
-from dptse_env.utils.fields import parse_json, require, shown
+from dptse_env.utils.validation import parse_json, require, shown
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 OTHER_DRIVERS: dict[str, Any] = {

@@ -33,9 +33,9 @@ from tqdm import tqdm
 
 from dptse_env.command_line import TOOLS
 from dptse_env.traffic.recording import follow_parent, uninterrupted
-from dptse_env.utils.fields import integer
 from dptse_env.utils.kernels import compiling_is_said
 from dptse_env.utils.registry import needed_for
+from dptse_env.utils.validation import integer
 
 TaskT = TypeVar("TaskT")
 ResultT = TypeVar("ResultT")

@@ -20,8 +20,8 @@ from dptse_env.importers.fields import FieldSource, by_second
 from dptse_env.parts import make_model, make_release
 from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Scales
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.fields import require
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import require
 
 
 class Field(NamedTuple):

@@ -18,8 +18,8 @@ from dptse_env.estimators.recurrent import member_for, read_network, shipped_net
 from dptse_env.evaluation import WARM_UP, Row, evaluate
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.traffic import Corridor, RecordLibrary, Records, open_library
-from dptse_env.utils.fields import require
 from dptse_env.utils.files import file_digest
+from dptse_env.utils.validation import require
 
 POLICY_SEED = 0
 """Seeds the draws of a schedule, and torch for the draws of a learned policy."""

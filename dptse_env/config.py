@@ -47,7 +47,8 @@ from dptse_env.traffic import (
     read_road,
 )
 from dptse_env.traffic.imported import has_vehicles, recorded_seeds, require_seeds
-from dptse_env.utils.fields import (
+from dptse_env.utils.registry import Registry
+from dptse_env.utils.validation import (
     Interval,
     convert,
     cut,
@@ -58,7 +59,6 @@ from dptse_env.utils.fields import (
     shown,
     within,
 )
-from dptse_env.utils.registry import Registry
 
 TRAINING_SEEDS = range(1_000)
 """Traffic seeds meant for training and calibration."""

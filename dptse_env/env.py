@@ -12,7 +12,7 @@ from dptse_env.env_base import QueryEnvBase
 from dptse_env.rendering import Drawing, Screen
 from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Observation
-from dptse_env.utils.fields import integer
+from dptse_env.utils.validation import integer
 
 _ONLY = np.zeros(1, dtype=np.int64)
 

@@ -16,7 +16,7 @@ from dptse_env.process import QueryProcess
 from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import BoolArray
-from dptse_env.utils.fields import require, within
+from dptse_env.utils.validation import require, within
 
 
 class QueryEnvBase:

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from dptse_env.env import SensorQueryEnv
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
-from dptse_env.utils.fields import require
+from dptse_env.utils.validation import require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 WARM_UP = 60

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, TypeVar
 
-from dptse_env.utils.fields import Interval, checked_fields, integer, require
+from dptse_env.utils.validation import Interval, checked_fields, integer, require
 
 T = TypeVar("T")
 

@@ -29,9 +29,9 @@ from dptse_env.spaces.observations import AGE_CAP, PublicState
 from dptse_env.spaces.rewards import EstimationError, ScoredSecond, estimation_error
 from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.fields import shown
 from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.threads import EpisodeThreads
+from dptse_env.utils.validation import shown
 from dptse_env.utils.vector_info import Infos, info_of
 
 TRUTH_INFO = ("rmse_density", "rmse_speed", "n_occupied", "traffic_seed", "truth")

@@ -19,7 +19,7 @@ from dptse_env.process import per_episode
 from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.fields import integer, require_name
+from dptse_env.utils.validation import integer, require_name
 from dptse_env.utils.vector_info import Infos, in_vector_form, object_array, repeated_infos
 
 _MODES = {mode.value: mode for mode in AutoresetMode}

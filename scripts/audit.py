@@ -14,8 +14,8 @@ from typing import Any
 from agents.audit.report import audit_environment, audit_one_run, check_target
 from agents.environments import make_config, make_vector, parse_env, quietly
 from dptse_env.parts import privacy_report
-from dptse_env.utils.fields import inside, integer, positive, require
 from dptse_env.utils.files import require_output
+from dptse_env.utils.validation import inside, integer, positive, require
 from scripts.cli import Environment, Machines
 
 

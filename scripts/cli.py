@@ -28,10 +28,10 @@ from dptse_env.traffic import (
     RecordLibrary,
     SumoVersionError,
 )
-from dptse_env.utils.fields import integer
 from dptse_env.utils.files import require_writable
 from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
+from dptse_env.utils.validation import integer
 
 
 @dataclass(frozen=True)

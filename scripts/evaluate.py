@@ -44,8 +44,8 @@ from dptse_env.policies import DETERMINISTIC
 from dptse_env.privacy import rounded_up
 from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.fields import require
 from dptse_env.utils.files import require_output
+from dptse_env.utils.validation import require
 from scripts.cli import Environment, Machines
 
 ALL = "all"

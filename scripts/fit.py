@@ -44,8 +44,8 @@ from dptse_env.model.parameters import read_parameters, write_parameters
 from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import RecordLibrary, ranges
 from dptse_env.traffic.roads import from_home
-from dptse_env.utils.fields import integer, require
 from dptse_env.utils.files import replacing, require_output, write_atomically
+from dptse_env.utils.validation import integer, require
 from dptse_env.versions import code_version
 from scripts.cli import Machines
 

@@ -24,8 +24,8 @@ from agents.environments import make_config, parse_env
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface
 from dptse_env.policies import DETERMINISTIC, SUFFIX
-from dptse_env.utils.fields import parse_json, require
 from dptse_env.utils.files import require_output
+from dptse_env.utils.validation import parse_json, require
 
 ENCODINGS: dict[type[gym.Space[Any]], str] = {
     spaces.MultiBinary: "mask",

@@ -20,7 +20,7 @@ from agents.figures import LABELS
 from agents.measured_field import Replay, field_corridor, read_field
 from agents.terminal import make_table, print_table
 from dptse_env.importers.fields import FieldSource
-from dptse_env.utils.fields import integer, parse_json, require
+from dptse_env.utils.validation import integer, parse_json, require
 
 ENV = "dptse_env:dptse/PaperHighway-v0"
 ESTIMATORS = ("ekf", "ukf", "random_walk", "blend", "asm", "recurrent", "mixture")

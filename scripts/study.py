@@ -23,8 +23,8 @@ from agents.seeds import seed_kind
 from agents.study import OWN, Study, write_report
 from agents.study import run as run_study
 from dptse_env.config import parse_seeds
-from dptse_env.utils.fields import require
 from dptse_env.utils.files import require_output
+from dptse_env.utils.validation import require
 from scripts.cli import Machines
 
 STUDIES = ("paper", "guarantees", "estimators", "roads", "policies", "suite")

@@ -23,8 +23,8 @@ from agents.studies import suite
 from agents.study import OWN, Study, play_study
 from agents.tables import are_present
 from agents.terminal import make_table, print_table
-from dptse_env.utils.fields import require, require_name
 from dptse_env.utils.files import require_output
+from dptse_env.utils.validation import require, require_name
 from scripts.cli import Machines
 
 CARD = "card.json"

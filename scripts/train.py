@@ -28,7 +28,7 @@ from agents.training.run_files import Row, check_plan, read_progress
 from agents.training.settings import PlackettLuceSettings, TrainingPlan, parse_algorithm
 from agents.training.training import train, train_all
 from dptse_env.config import parse_seeds
-from dptse_env.utils.fields import integer, parse_json, read_json, require
+from dptse_env.utils.validation import integer, parse_json, read_json, require
 from scripts.cli import Machines
 
 MINUTES = 10.0

@@ -38,8 +38,8 @@ from agents.terminal import make_table, print_table
 from agents.training.run_files import PLAN, PROGRESS, Row, check_plan, read_progress
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import member_for, read_network
-from dptse_env.utils.fields import from_mapping, parse_json, require
 from dptse_env.utils.files import replacing, require_output
+from dptse_env.utils.validation import from_mapping, parse_json, require
 from scripts.cli import Machines
 
 NAME = "network"

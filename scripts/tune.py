@@ -24,8 +24,8 @@ from agents.executors import make_executor
 from agents.search.space import SPACE, Extra
 from agents.search.tuning import Search, chosen, journal_path, tune, write
 from agents.terminal import make_table, print_table
-from dptse_env.utils.fields import integer
 from dptse_env.utils.files import require_output
+from dptse_env.utils.validation import integer
 from scripts.cli import Recording
 
 

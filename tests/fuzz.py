@@ -57,7 +57,7 @@ from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.spaces.observations import BLOCKS
 from dptse_env.spaces.rewards import REWARDS
 from dptse_env.traffic import CORRIDORS, SHORT_HIGHWAY, Corridor, write_corridor
-from dptse_env.utils.fields import Interval, field_hints
+from dptse_env.utils.validation import Interval, field_hints
 from tests.hostile import ODD, changed, changed_tensors
 from tests.importers.data import PLAIN, SPLITS, STRAIGHT, plain, stream
 from tests.importers.sumo_net.conftest import PATH, motorway

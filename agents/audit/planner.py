@@ -16,7 +16,7 @@ from dptse_env.release.vehicles import Terms
 from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import require
+from dptse_env.utils.validation import require
 
 KINDS = ("worst-case", "opposite", "replaced", "deleted")
 """Kinds of targets; see `Planner.choose`."""

@@ -31,7 +31,7 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of, mu_of, rounded_up
 from dptse_env.release import PrivacyReport
 from dptse_env.traffic import Record
-from dptse_env.utils.fields import require
+from dptse_env.utils.validation import require
 from dptse_env.versions import versions_with
 
 VIOLATION = math.sqrt(2.0)

@@ -20,7 +20,7 @@ from dptse_env.config import EnvConfig
 from dptse_env.parts import make_task
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import integer
+from dptse_env.utils.validation import integer
 
 CLIMBED = "climbed"
 """Name of the target that a search finds."""

@@ -48,7 +48,7 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import beta, binom
 
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.fields import (
+from dptse_env.utils.validation import (
     POSITIVE,
     Interval,
     checked_fields,

@@ -25,7 +25,7 @@ from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.recurrent import FORMAT, read_network
 from dptse_env.estimators.recurrent_kernels import CHANNELS
-from dptse_env.utils.fields import Interval, checked_fields, integer, require
+from dptse_env.utils.validation import Interval, checked_fields, integer, require
 from dptse_env.versions import versions_with
 
 

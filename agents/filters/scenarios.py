@@ -14,7 +14,7 @@ import numpy as np
 
 from agents.environments import make_config, parse_env
 from agents.filters.highways import SEGMENTS, Section, draw_highway
-from dptse_env.utils.fields import Interval, checked_fields, require
+from dptse_env.utils.validation import Interval, checked_fields, require
 
 Kind = Literal["flows", "speeds"]
 """Kind of the numbers that are released beside densities; a network knows one kind."""

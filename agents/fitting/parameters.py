@@ -24,7 +24,7 @@ from dptse_env.model import ARZModel, ARZParameters
 from dptse_env.release import Traffic
 from dptse_env.traffic import Corridor, RecordLibrary
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.fields import read_json
+from dptse_env.utils.validation import read_json
 
 FIELDS = ("free_flow_speed", "jam_density", "gamma", "relaxation_time")
 """Parameters that are searched, the jam density for one lane."""

@@ -32,8 +32,8 @@ from dptse_env.traffic import (
 )
 from dptse_env.traffic.imported import has_vehicles, recorded_seeds
 from dptse_env.traffic.sumo_input import network_xml
-from dptse_env.utils.fields import read_json, require
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import read_json, require
 from dptse_env.versions import code_version
 
 CHOSEN = ("parameters", "estimator", "estimator_settings")

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 
 from dptse_env.estimators import DemandSettings, EstimatorSettings
-from dptse_env.utils.fields import require_name
+from dptse_env.utils.validation import require_name
 
 Knob = FloatDistribution | CategoricalDistribution
 """The values that the search can give a setting."""

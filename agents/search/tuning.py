@@ -49,8 +49,8 @@ from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned import settings_name, write_settings
 from dptse_env.evaluation import Row
 from dptse_env.traffic import Records
-from dptse_env.utils.fields import from_mapping, require
 from dptse_env.utils.files import replacing
+from dptse_env.utils.validation import from_mapping, require
 from dptse_env.versions import code_version
 
 logger = logging.getLogger(__name__)

@@ -48,7 +48,7 @@ from dptse_env.config import parse_seeds
 from dptse_env.parts import privacy_report
 from dptse_env.policies import shipped_policies
 from dptse_env.privacy import rounded_up
-from dptse_env.utils.fields import number, parse_json, require
+from dptse_env.utils.validation import number, parse_json, require
 from dptse_env.versions import code_version, numbers_of
 
 NAME = "query-suite-v3"

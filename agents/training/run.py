@@ -32,7 +32,7 @@ from agents.training.settings import TrainingPlan
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import ActingPolicy, save_policy
 from dptse_env.traffic import Records
-from dptse_env.utils.fields import read_json, require
+from dptse_env.utils.validation import read_json, require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 POLICY, BEST = "policy.safetensors", "best.safetensors"

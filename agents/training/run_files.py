@@ -12,8 +12,8 @@ from typing import Any
 import torch
 
 from agents.files import first_difference, write_json
-from dptse_env.utils.fields import cut, read_json, require
 from dptse_env.utils.files import require_output, write_atomically
+from dptse_env.utils.validation import cut, read_json, require
 
 PLAN, CHECKPOINT, PROGRESS = "plan.json", "checkpoint.pt", "progress.csv"
 

@@ -21,7 +21,7 @@ from dptse_env.parts import make_interface
 from dptse_env.policies import read_policy
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.sb3 import RoadPolicy
-from dptse_env.utils.fields import (
+from dptse_env.utils.validation import (
     POSITIVE,
     Interval,
     checked_fields,

@@ -9,7 +9,7 @@ from typing import Any
 
 import griffe
 
-from dptse_env.utils.fields import Interval, allowed_numbers
+from dptse_env.utils.validation import Interval, allowed_numbers
 from scripts.dptse import GROUPS, MODULES
 
 

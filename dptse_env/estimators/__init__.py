@@ -17,8 +17,8 @@ from dptse_env.estimators.settings import (
 )
 from dptse_env.estimators.tuned import load_settings
 from dptse_env.model import ARZModel
-from dptse_env.utils.fields import shown
 from dptse_env.utils.registry import Registry, is_foreign
+from dptse_env.utils.validation import shown
 
 __all__ = [
     "BACKENDS",

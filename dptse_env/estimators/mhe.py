@@ -38,7 +38,6 @@ from dptse_env.model.parameters import (
 from dptse_env.model.step import advance, make_scratch, normalise, project, write_channel
 from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import integer, positive
 from dptse_env.utils.kernels import (
     Bundle,
     all_finite,
@@ -48,6 +47,7 @@ from dptse_env.utils.kernels import (
     kernel,
     kernel_part,
 )
+from dptse_env.utils.validation import integer, positive
 
 # Least deviation of a measurement, normalised: an exact one would have an infinite weight.
 LEAST_DEVIATION = 1e-3

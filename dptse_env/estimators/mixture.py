@@ -12,7 +12,7 @@ from dptse_env.estimators.settings import EstimatorSettings, RecurrentSettings
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
 from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.fields import within
+from dptse_env.utils.validation import within
 
 LEAST_VARIANCE = 1e-12
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 from dptse_env.model import Bounds
-from dptse_env.utils.fields import Interval, checked_fields, shown
+from dptse_env.utils.validation import Interval, checked_fields, shown
 
 Linearisation = Literal["paper", "trajectory"]
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from dptse_env.estimators.settings import PATH, EstimatorSettings
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
-from dptse_env.utils.fields import check_object, cut, from_mapping, read_json, shown, within
+from dptse_env.utils.validation import check_object, cut, from_mapping, read_json, shown, within
 
 _KEYS = {"estimator": str, "settings": dict, "provenance": dict}
 

@@ -42,7 +42,6 @@ from dptse_env.model.columns import (
 )
 from dptse_env.model.step import project
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import require
 from dptse_env.utils.kernels import (
     Bundle,
     all_finite,
@@ -51,6 +50,7 @@ from dptse_env.utils.kernels import (
     kernel,
     kernel_part,
 )
+from dptse_env.utils.validation import require
 
 
 class Points(NamedTuple):

@@ -29,7 +29,9 @@ from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
-from dptse_env.utils.fields import (
+from dptse_env.utils.files import require_output
+from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import (
     Interval,
     cut,
     integer,
@@ -39,8 +41,6 @@ from dptse_env.utils.fields import (
     require,
     require_name,
 )
-from dptse_env.utils.files import require_output
-from dptse_env.utils.units import HOUR
 
 UNITS = {
     "density": {f"veh/{name}": 1.0 / LENGTHS[name] for name in ("km", "mi", "ft", "m")},

@@ -25,8 +25,8 @@ from dptse_env.traffic.corridor import Corridor, Recordings
 from dptse_env.traffic.imported import Kind, load_record, ranges, save_record, write_manifest
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.roads import write_corridor
-from dptse_env.utils.fields import require, require_name
 from dptse_env.utils.files import hidden, left_hidden, require_output
+from dptse_env.utils.validation import require, require_name
 
 ROAD = "road.toml"
 NO_SPACE = 2**16

@@ -10,7 +10,7 @@ from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.record import Record, average_dwell
-from dptse_env.utils.fields import require
+from dptse_env.utils.validation import require
 
 LEAST_SHARE = 0.001
 """Exit shares must be above 0 and below 1: nobody or everybody leaving counts as this much."""

@@ -14,7 +14,7 @@ from dptse_env.importers.source import Layout
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.sumo_input import edge_ids
 from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.fields import require
+from dptse_env.utils.validation import require
 
 OFF = -1
 """Branch and column of a point that is not on the road."""

@@ -30,7 +30,7 @@ from dptse_env.importers.resampling import (
 from dptse_env.importers.source import Source, TrajectoryError
 from dptse_env.importers.units import SAMPLE, check_units, motion
 from dptse_env.traffic.record import Record
-from dptse_env.utils.fields import cut, inside, integer, non_negative, shown
+from dptse_env.utils.validation import cut, inside, integer, non_negative, shown
 
 BUCKET_ROWS = 400_000
 """Rows of a bucket; buckets are in memory one at a time."""

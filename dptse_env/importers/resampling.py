@@ -12,8 +12,8 @@ from dptse_env.importers.placing import Branches
 from dptse_env.importers.source import Source, TrajectoryError
 from dptse_env.importers.units import Motion, check_units
 from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.fields import shown
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import shown
 
 TIME_UNIT = 1e-4
 """Times are rounded to this [s]: sums of frame lengths are not whole in floating point."""

@@ -10,7 +10,7 @@ import os
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from dptse_env.utils.fields import (
+from dptse_env.utils.validation import (
     Interval,
     checked_fields,
     from_mapping,

@@ -20,8 +20,8 @@ import polars as pl
 from polars.io.plugins import register_io_source
 
 from dptse_env.importers.source import LABELS, NUMBERS, Source, TrajectoryError
-from dptse_env.utils.fields import cut, shown
 from dptse_env.utils.files import open_unzipped
+from dptse_env.utils.validation import cut, shown
 
 SCHEMA = {
     "row": pl.Int64,

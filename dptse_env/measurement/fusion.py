@@ -14,8 +14,8 @@ import numpy as np
 from dptse_env.estimators import Estimate, Measurement
 from dptse_env.release import Task
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.fields import Interval, checked_fields
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import Interval, checked_fields
 
 LEAST_SPEED = 5.0
 """Speed from which on the time on a segment does not grow any more [km/h]."""

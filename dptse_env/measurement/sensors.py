@@ -11,7 +11,7 @@ from dptse_env.estimators import Measurement
 from dptse_env.release import Group, Request, Task
 from dptse_env.traffic import Corridor, Penetration
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.validation import Interval, checked_fields
 
 CountFactor = Annotated[float, Interval(0, 10)]
 """A factor on a detector's count."""

@@ -28,8 +28,8 @@ from dptse_env.model.parameters import (
 from dptse_env.model.step import jacobians, next_states, write_inputs
 from dptse_env.road import Road
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.fields import non_negative
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import non_negative
 
 
 class ARZModel:

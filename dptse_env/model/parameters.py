@@ -11,7 +11,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from dptse_env.utils.fields import (
+from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import (
     Interval,
     check_object,
     checked_fields,
@@ -21,7 +22,6 @@ from dptse_env.utils.fields import (
     require_name,
     within,
 )
-from dptse_env.utils.units import HOUR
 
 LARGEST_W = 1.1
 """Largest w of a physical state, in units of v_f."""

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from dptse_env.utils.arrays import AnyArray
-from dptse_env.utils.fields import require_name
 from dptse_env.utils.files import read_tensors
 from dptse_env.utils.registry import require_registered
+from dptse_env.utils.validation import require_name
 
 SUFFIX = ".safetensors"
 """Ending of the names of files with weights."""

@@ -28,7 +28,7 @@ from scipy.special import erfcx, log_ndtr, ndtri
 
 from dptse_env.privacy.sensitivity import Sensitivity
 from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.fields import inside, integer, positive, require
+from dptse_env.utils.validation import inside, integer, positive, require
 
 DELTAS = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")
 """Values of delta at which reports give epsilon."""

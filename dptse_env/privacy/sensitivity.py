@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from dptse_env.utils.fields import integer, positive
+from dptse_env.utils.validation import integer, positive
 
 Adjacency = Literal["replace", "add_remove"]
 """Difference of adjacent records: a vehicle's data replaced by another's, or a vehicle added."""

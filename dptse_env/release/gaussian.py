@@ -32,7 +32,7 @@ from dptse_env.release.task import Request, Task
 from dptse_env.release.vehicles import Ledgers, Terms, Traffic, require_exact_sums
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import FloatArray, IntArray
-from dptse_env.utils.fields import Interval
+from dptse_env.utils.validation import Interval
 from dptse_env.utils.vector_info import Infos, object_array
 
 Unit = Literal["trip", "event"]

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from dptse_env.privacy import Adjacency, rounded_up
 from dptse_env.release.noise import NoiseSource
-from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.validation import Interval, checked_fields
 
 BoundaryInputs = Literal["true", "nominal", "private"]
 """Source of the estimator's inputs at the boundary: measured traffic, public demand, or the

@@ -26,8 +26,8 @@ from dptse_env.model import Channels
 from dptse_env.release.noise import grid_of
 from dptse_env.traffic import MOST_VEHICLES, Corridor, Penetration, Record, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import require
 from dptse_env.utils.kernels import Bundle, kernel
+from dptse_env.utils.validation import require
 
 GROWTH = 1.5
 """Factor on the size of full tables."""

@@ -28,9 +28,9 @@ from dptse_env.sb3.vec_env import config_of
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.traffic import Corridor
 from dptse_env.utils.arrays import AnyArray
-from dptse_env.utils.fields import integer, require, require_name, shown
 from dptse_env.utils.files import require_arrays, write_tensors
 from dptse_env.utils.registry import needed_for, require_registered
+from dptse_env.utils.validation import integer, require, require_name, shown
 from dptse_env.versions import versions_with
 
 POLICY_FORMAT = "dptse-policy-2"

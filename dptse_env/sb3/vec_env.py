@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from dptse_env.config import EnvConfig
 from dptse_env.utils.arrays import Action, Observation
-from dptse_env.utils.fields import integer
+from dptse_env.utils.validation import integer
 from dptse_env.utils.vector_info import info_of
 from dptse_env.vector_env import SensorQueryVectorEnv
 

@@ -23,7 +23,9 @@ from dptse_env.traffic.demand import (
     VehicleClass,
 )
 from dptse_env.traffic.own_sumo import SumoScenario
-from dptse_env.utils.fields import (
+from dptse_env.utils.files import json_digest
+from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import (
     Interval,
     checked_fields,
     cut,
@@ -32,8 +34,6 @@ from dptse_env.utils.fields import (
     integer,
     require,
 )
-from dptse_env.utils.files import json_digest
-from dptse_env.utils.units import HOUR
 
 DENSITY_SCALE = 111.0
 """Scale of densities for each lane [veh/km]."""

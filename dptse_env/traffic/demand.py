@@ -14,7 +14,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from dptse_env.geometry import Share
-from dptse_env.utils.fields import Interval, checked_fields, require
+from dptse_env.utils.validation import Interval, checked_fields, require
 
 Rate = Annotated[float, Interval(0, 100_000)]
 """Vehicles an hour."""

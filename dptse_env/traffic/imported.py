@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 from dptse_env.traffic.corridor import Recordings
 from dptse_env.traffic.record import InvalidRecordError, Record
-from dptse_env.utils.fields import check_object, integer, parse_json
 from dptse_env.utils.files import json_digest
+from dptse_env.utils.validation import check_object, integer, parse_json
 
 MANIFEST = "manifest.json"
 FORMAT = "dptse-recordings"

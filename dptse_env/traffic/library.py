@@ -33,10 +33,10 @@ from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
 from dptse_env.traffic.recording import record_seeds
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, sumo_version
 from dptse_env.traffic.sumo_input import NetworkError
-from dptse_env.utils.fields import integer, require
 from dptse_env.utils.files import require_writable
 from dptse_env.utils.threads import n_cores
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import integer, require
 
 CACHE_VARIABLE = "DPTSE_CACHE"
 """Environment variable with the directory of the records; errors name it."""

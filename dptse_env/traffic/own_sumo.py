@@ -22,8 +22,8 @@ from typing import Annotated
 from xml.etree import ElementTree
 
 from dptse_env.traffic.demand import Incident, lowest_limit
-from dptse_env.utils.fields import Interval, checked_fields, require, shown
 from dptse_env.utils.files import file_digest, open_unzipped
+from dptse_env.utils.validation import Interval, checked_fields, require, shown
 
 Position = Annotated[float, Interval(0, 1e6)]
 """Place on an edge, from its start [m]."""

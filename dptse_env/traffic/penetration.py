@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dptse_env.traffic.record import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray
-from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.validation import Interval, checked_fields
 
 ConnectedShare = Annotated[float, Interval(1e-9, 1)]
 """A share of connected vehicles, the smallest of which is as good as none."""

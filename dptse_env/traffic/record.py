@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from dptse_env.utils.fields import integer, require
 from dptse_env.utils.files import read_tensors, write_tensors
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import integer, require
 
 RECORD_FORMAT = "dptse-record"
 RECORD_VERSION = 2

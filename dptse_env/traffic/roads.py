@@ -24,9 +24,9 @@ import tomli_w
 from dptse_env.geometry import Geometry
 from dptse_env.traffic.corridor import Conditions, Corridor, Scales
 from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, IncidentDistribution
-from dptse_env.utils.fields import read_toml, require, within
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.registry import Registry, require_registered
+from dptse_env.utils.validation import read_toml, require, within
 
 SUFFIX = ".toml"
 """Ending of the name of a road file."""

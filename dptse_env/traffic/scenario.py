@@ -17,8 +17,8 @@ from dptse_env.traffic.demand import (
     IncidentDistribution,
     value_at,
 )
-from dptse_env.utils.fields import integer
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import integer
 
 MAINLINE = -1
 """Origin or exit of a vehicle that enters or leaves by the mainline instead of a ramp."""

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from importlib.metadata import entry_points
 from typing import Any
 
-from dptse_env.utils.fields import cut, require, shown
+from dptse_env.utils.validation import cut, require, shown
 
 PLUGINS = "dptse_env.plugins"
 """Group of entry points of other packages. Each names a function that registers their parts; it is

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Any, TypeVar
 
 from dptse_env.utils.arrays import IntArray
-from dptse_env.utils.fields import integer
+from dptse_env.utils.validation import integer
 
 Data = TypeVar("Data")
 

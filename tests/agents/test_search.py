@@ -22,7 +22,7 @@ from agents.search.tuning import BATCH, Search, chosen, journal_path, n_finished
 from dptse_env.estimators import ESTIMATORS, EstimatorSettings
 from dptse_env.estimators.tuned import available_settings, load_settings, read_settings
 from dptse_env.evaluation import evaluate
-from dptse_env.utils.fields import from_mapping
+from dptse_env.utils.validation import from_mapping
 from tests.helpers import SHORT, save_untrained
 
 KEYWORDS = {"parameters": "w99-3lane", "epsilon": 1.0, "delta": 0.05, "bandwidth": 2}

@@ -12,7 +12,7 @@ from dptse_env.model.parameters import (
     read_parameters,
     write_parameters,
 )
-from dptse_env.utils.fields import from_mapping
+from dptse_env.utils.validation import from_mapping
 from tests.helpers import UNEVEN
 
 from .oracle import HIGHWAY, PAPER

@@ -8,8 +8,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from dptse_env.utils import fields
-from dptse_env.utils.fields import read_toml
+from dptse_env.utils import validation
 from dptse_env.utils.files import (
     read_tensors,
     replacing,
@@ -17,6 +16,7 @@ from dptse_env.utils.files import (
     write_atomically,
     write_tensors,
 )
+from dptse_env.utils.validation import read_toml
 from tests.hostile import check_hostile
 
 CARD = {"name": "ünïcode", "steps": [1, 2.5, None], "nested": {"b": True}}
@@ -57,7 +57,7 @@ def test_damage_is_refused(path, tmp_path):
 
 
 def test_what_is_too_large_is_refused_unread(path, monkeypatch):
-    monkeypatch.setattr(fields, "LARGEST_TOML", 8)
+    monkeypatch.setattr(validation, "LARGEST_TOML", 8)
     monkeypatch.setattr(Path, "read_bytes", lambda path: pytest.fail(f"{path} is read"))
     for read in (lambda: read_tensors(path, largest=8), lambda: read_toml(path, "road file")):
         with pytest.raises(ValueError, match=r"good\.safetensors.* at most 8 bytes, got"):

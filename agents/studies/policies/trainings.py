@@ -35,7 +35,7 @@ from agents.training.run_files import PLAN, check_plan, keep_plan, read_progress
 from agents.training.settings import TrainingPlan, parse_algorithm
 from agents.training.training import require_trained, train
 from dptse_env.traffic import Records
-from dptse_env.utils.fields import positive
+from dptse_env.utils.validation import positive
 
 BEST_LEARNERS = 2
 """Learners of each setting that are trained with every training seed."""

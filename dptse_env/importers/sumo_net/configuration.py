@@ -9,8 +9,8 @@ from xml.etree import ElementTree
 
 from dptse_env.importers.sumo_net.net import root_of
 from dptse_env.traffic.own_sumo import TRAFFIC, UNREADABLE, clock, copy_input
-from dptse_env.utils.fields import shown, within
 from dptse_env.utils.files import open_unzipped
+from dptse_env.utils.validation import shown, within
 
 SHORT = {
     "n": "net-file", "net": "net-file",

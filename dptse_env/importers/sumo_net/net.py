@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 from xml.sax import SAXException
 
 from dptse_env.traffic.own_sumo import UNREADABLE
-from dptse_env.utils.fields import shown
 from dptse_env.utils.files import open_unzipped
+from dptse_env.utils.validation import shown
 
 NEWEST_VERSION = (1, 20)
 """Newest version of net files that the supported release of SUMO reads."""

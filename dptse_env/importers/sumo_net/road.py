@@ -20,9 +20,9 @@ from dptse_env.traffic.record import Record
 from dptse_env.traffic.recording import simulate_in_worker
 from dptse_env.traffic.sumo import RecordingError
 from dptse_env.utils.arrays import BoolArray, IntArray
-from dptse_env.utils.fields import require
 from dptse_env.utils.files import file_digest
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import require
 
 NEVER = np.iinfo(np.int64).max
 """First step of a vehicle on a column where it never is."""

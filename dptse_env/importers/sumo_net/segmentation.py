@@ -21,7 +21,7 @@ from dptse_env.importers.sumo_net.net import (
 )
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic.own_sumo import TOLERANCE, Stretch
-from dptse_env.utils.fields import require, shown
+from dptse_env.utils.validation import require, shown
 
 PARAMETERS = "w99-3lane"
 """Shipped parameters that allow the shortest segments."""

@@ -14,7 +14,7 @@ from dptse_env.release import PrivacyReport, PrivacySettings, ReleaseModel
 from dptse_env.schedules import Schedule
 from dptse_env.spaces.actions import ActionEncoding, Decision
 from dptse_env.traffic import SHORT_HIGHWAY
-from dptse_env.utils.fields import Interval, checked_fields
+from dptse_env.utils.validation import Interval, checked_fields
 
 ROAD = SHORT_HIGHWAY.replaced(name="plugin-road", fixed_sensors=(0, 5))
 

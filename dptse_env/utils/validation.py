@@ -1,4 +1,4 @@
-"""Fields of configuration dataclasses: types, ranges, and values from plain JSON.
+"""Validation of configuration dataclasses: types, ranges, and values from plain JSON.
 
 Keyword values of ``gym.make`` travel as JSON, so every configuration must be reachable from
 dictionaries, lists, strings and numbers. The annotation of a field declares its type and range,

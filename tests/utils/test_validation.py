@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from dptse_env.utils import fields
-from dptse_env.utils.fields import from_mapping
+from dptse_env.utils import validation
+from dptse_env.utils.validation import from_mapping
 from tests.hostile import nested
 
 
@@ -78,9 +78,9 @@ def test_errors_name_the_path():
 
 def test_numbers_come_back_plain_and_bad_ones_are_named():
     for check, beyond in (
-        (fields.positive, (-1, 0.0)),
-        (fields.non_negative, (-0.5,)),
-        (partial(fields.inside, low=0.0, high=0.5), (0.0, 0.5)),
+        (validation.positive, (-1, 0.0)),
+        (validation.non_negative, (-0.5,)),
+        (partial(validation.inside, low=0.0, high=0.5), (0.0, 0.5)),
     ):
         for value in (0.25, np.float32(0.25), np.float64(0.25)):
             assert type(check("x", value)) is float
@@ -88,12 +88,12 @@ def test_numbers_come_back_plain_and_bad_ones_are_named():
         for value in (*beyond, math.nan, math.inf, None, True, [1.0], 1j):
             with pytest.raises(ValueError, match=r"^a\.b must be a .*, got "):
                 check("a.b", value)
-    assert fields.non_negative("x", 0) == 0.0
-    assert type(fields.positive("x", 3)) is float
-    assert type(fields.integer("n", np.int64(4), 1)) is int
+    assert validation.non_negative("x", 0) == 0.0
+    assert type(validation.positive("x", 3)) is float
+    assert type(validation.integer("n", np.int64(4), 1)) is int
     for value in (0, 6, 1.0, "1", True, None):
         with pytest.raises(ValueError, match=rf"^n must be .*, got {value!r}$"):
-            fields.integer("n", value, 1, 5)
+            validation.integer("n", value, 1, 5)
 
 
 def test_values_are_shown_in_one_short_line():
@@ -105,6 +105,6 @@ def test_values_are_shown_in_one_short_line():
         (nested(5000), "[[[[[[...]]]]]]"),
         (np.zeros((2, 2)), "array([[0., 0.], [0., 0.]])"),
     ):
-        assert fields.shown(value) == text
-    assert fields.cut("a b\n") == r"a b\n"
-    assert max(len(fields.shown("x" * 10**6)), len(fields.cut("x" * 10**6))) <= 203
+        assert validation.shown(value) == text
+    assert validation.cut("a b\n") == r"a b\n"
+    assert max(len(validation.shown("x" * 10**6)), len(validation.cut("x" * 10**6))) <= 203
