@@ -1,4 +1,4 @@
-"""Import recorded trajectories, a SUMO network or a measured field as a road.
+"""Import recorded trajectories, a SUMO net or a measured field as a road.
 
 dptse import trajectories --help
 """
@@ -148,7 +148,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Network:
-    r"""Make a road of a SUMO network, as a TOML file that an environment takes as its corridor.
+    r"""Make a road of a SUMO net, as a TOML file that an environment takes as its corridor.
 
     dptse import network --configuration town.sumocfg --path "in ... out" \
         --duration 120 --output my-road.toml
@@ -157,9 +157,9 @@ class Network:
     output: Path = Path("road.toml")
     """The road file to write; the name of the road is that of the file."""
     configuration: Path | None = None
-    """SUMO's configuration, a .sumocfg, with network, routes, additional files and options."""
+    """SUMO's configuration, a .sumocfg, with net, routes, additional files and options."""
     net: Path | None = None
-    """Network file, in place of the configuration's; so below."""
+    """Net file, in place of the configuration's; so below."""
     routes: tuple[Path, ...] = ()
     """Route files."""
     additional: tuple[Path, ...] = ()
@@ -298,10 +298,10 @@ def print_next(
 
 
 def describe(road: ImportedRoad) -> str:
-    """Describe a road of a network in a few lines."""
+    """Describe a road of a SUMO net in a few lines."""
     corridor, names = road.corridor, road.segments.names
-    geometry, network = corridor.geometry, corridor.source.network
-    assert network is not None
+    geometry, files = corridor.geometry, corridor.source.sumo
+    assert files is not None
     n, n_on = geometry.n_mainline, geometry.n_on_ramps
     lengths, lanes, limits = (
         each[:n]
@@ -309,8 +309,8 @@ def describe(road: ImportedRoad) -> str:
     )
     demand = corridor.conditions.published_demand
     lines = [
-        f"{corridor.name}: from {Path(network.net).name}, seconds {network.begin} to "
-        f"{network.begin + corridor.conditions.duration}",
+        f"{corridor.name}: from {Path(files.net).name}, seconds {files.begin} to "
+        f"{files.begin + corridor.conditions.duration}",
         f"{n} segments of {1000 * min(lengths):.0f} to {1000 * max(lengths):.0f} m, "
         f"{min(lanes)} to {max(lanes)} lanes, {min(limits):.0f} to {max(limits):.0f} km/h",
         f"mainline: {_range(demand.mainline)}",

@@ -198,7 +198,7 @@ def _lies_in(value: Any, folder: Path) -> bool:
 
 def _check_road(path: Path, corridor: Corridor) -> None:
     """Refuse a road without traffic or network, and segments that suit no set of parameters."""
-    if corridor.source.recordings is None and corridor.source.network is None:
+    if corridor.source.recordings is None and corridor.source.sumo is None:
         rates = [rate for _, rate in corridor.conditions.published_demand.mainline]
         require(max(rates) > 0.0, f"{path}: demand.mainline", "above 0 veh/h at some time", rates)
         network_xml(

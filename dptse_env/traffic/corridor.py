@@ -123,7 +123,7 @@ class Source:
     """The origin of the records of a road: simulation by SUMO, unless a field says otherwise.
 
     Attributes:
-        network: SUMO files of one's own, from which the road is recorded; None for a network made
+        sumo: SUMO files of one's own, from which the road is recorded; None for a net that is made
             of the corridor's geometry. With files, the vehicles are those of the files: the rates
             of `demand` are what is published of them, the range of a `DemandDistribution` scales
             them (SUMO's ``--scale``), `exit_shares` are published too, an incident limits the
@@ -135,14 +135,14 @@ class Source:
         ValueError: Both are given.
     """
 
-    network: SumoScenario | None = None
+    sumo: SumoScenario | None = None
     recordings: Recordings | None = None
 
     def __post_init__(self) -> None:
         """Check the fields and bring them to their declared types."""
         checked_fields(self, "corridor")
-        fits = self.network is None or self.recordings is None
-        allowed = "None on a road with a network of its own"
+        fits = self.sumo is None or self.recordings is None
+        allowed = "None on a road with SUMO files of its own"
         require(fits, "corridor.recordings", allowed, self.recordings)
 
 
@@ -253,11 +253,11 @@ class Corridor:
                 "fixed where traffic is recorded",
             )
             require(fixed, "corridor.demand", allowed, conditions.demand)
-        if source.network is not None:
-            columns, n_columns = len(source.network.columns), self.record_shape[1]
+        if source.sumo is not None:
+            columns, n_columns = len(source.sumo.columns), self.record_shape[1]
             allowed = f"one for each of the {n_columns} record columns of this geometry"
-            require(columns == n_columns, "corridor.network.columns", allowed, columns)
-            plain, allowed = conditions.drivers == Drivers(), "left out on a road with a network"
+            require(columns == n_columns, "corridor.sumo.columns", allowed, columns)
+            plain, allowed = conditions.drivers == Drivers(), "left out on a road with SUMO files"
             require(plain, "corridor.drivers", f"{allowed} of its own", conditions.drivers)
         fits = not conditions.vehicle_classes or source == Source()
         allowed = "left out where the traffic has classes of its own"
@@ -343,14 +343,14 @@ class Corridor:
         """SHA-256 (hex) of what determines the traffic, stable across processes.
 
         Corridors with the same geometry, conditions and source share their records. With a
-        `network`, its files, the demand's scale, the incident and the duration determine them.
+        `sumo`, its files, the demand's scale, the incident and the duration determine them.
         """
         content = dataclasses.asdict(self)
-        conditions, network = content["conditions"], self.source.network
-        if network is not None:
+        conditions, sumo = content["conditions"], self.source.sumo
+        if sumo is not None:
             return json_digest(
                 {
-                    "network": network.traffic,
+                    "sumo": sumo.traffic,
                     "scale": conditions["demand"].get("scale"),
                     "incident": conditions["incident"],
                     "duration": conditions["duration"],

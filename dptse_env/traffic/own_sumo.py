@@ -1,6 +1,6 @@
-"""SUMO files of one's own: what a road is recorded from in place of a network made for it.
+"""SUMO files of one's own: what a road is recorded from in place of a net made for it.
 
-The network, its internal links, routes, vehicle types and options are those of the files. Four
+The net, its internal links, routes, vehicle types and options are those of the files. Four
 things differ from ``sumo -c``: the seed is that of the traffic seed, the demand may be scaled,
 vehicles are in order of departure, and nothing is written. SUMO gets copies of the files that name
 no file, and those options alone that change the traffic, in an empty folder.
@@ -66,7 +66,7 @@ MOST_KINDS = 5
 """Kinds of warnings that are told."""
 
 TOLERANCE = 0.01
-"""Precision of lengths in network files [m]."""
+"""Precision of lengths in net files [m]."""
 
 Remark = Callable[[str], object]
 """Takes a sentence for people."""
@@ -74,7 +74,7 @@ Remark = Callable[[str], object]
 KMH = 3.6
 """Factor from m/s to km/h."""
 
-_PATH = "corridor.network"
+_PATH = "corridor.sumo"
 _FILE = re.compile(r"(^|[._-])(files?|output|dest|href)$|File$|Output$")
 """Attributes, and keys of parameters, that name files."""
 _MEASURES = re.compile(rf"(has|(person-)?device)\.(?!({_DEVICES})\.)")
@@ -98,11 +98,11 @@ class SumoScenario:
     """SUMO's files for a road, and the places on their edges that a record counts.
 
     Attributes:
-        net: network file.
+        net: net file.
         routes: route files, in SUMO's order.
         columns: for each record column (the S segments, then the R boundary segments) the stretches
             of edges that belong to it. A vehicle counts where its front bumper is.
-        sha256: SHA-256 (hex) of each file: the network, the route files, the additional files.
+        sha256: SHA-256 (hex) of each file: the net, the route files, the additional files.
         folder: folder of the files; in a road file it may be relative to that file. Their names are
             relative to it.
         additional: additional files, in SUMO's order.
@@ -173,7 +173,7 @@ class SumoScenario:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of all files: the network, the route files, the additional files."""
+        """Names of all files: the net, the route files, the additional files."""
         return (self.net, *self.routes, *self.additional)
 
     @property
@@ -220,7 +220,7 @@ class SumoScenario:
 
 
 class Places:
-    """Places of the record columns on the edges of a network.
+    """Places of the record columns on the edges of a net.
 
     Args:
         columns: as in `SumoScenario`.
@@ -247,12 +247,12 @@ class Places:
         return parts[index][2]
 
 
-def command(folder: Path, network: SumoScenario, seed: int, scale: float) -> list[str]:
+def command(folder: Path, files: SumoScenario, seed: int, scale: float) -> list[str]:
     """Return SUMO's command line, whose names of files are relative to a folder, and plain ASCII.
 
     Args:
         folder: an empty folder, for copies of the files, in which SUMO has to run.
-        network: the files, which are checked against their digests.
+        files: the files, which are checked against their digests.
         seed: SUMO's seed.
         scale: factor on the demand [-].
 
@@ -260,22 +260,22 @@ def command(folder: Path, network: SumoScenario, seed: int, scale: float) -> lis
         ChangedFilesError: A file is missing or has changed.
         ValueError: A file is no XML, or reads another file.
     """
-    network.check_files()
-    begin, words = network.begin - network.warm_up, ["sumo"]
-    for option, names in (("n", (network.net,)), ("r", network.routes), ("a", network.additional)):
+    files.check_files()
+    begin, words = files.begin - files.warm_up, ["sumo"]
+    for option, names in (("n", (files.net,)), ("r", files.routes), ("a", files.additional)):
         copies = [f"{option}{i}.xml" for i in range(len(names))]
         for name, copy in zip(names, copies, strict=True):
-            copy_input(network.path(name), folder / copy, begin)
+            copy_input(files.path(name), folder / copy, begin)
         words += [f"-{option}", ",".join(copies)] if copies else []
     return [
         *(*words, "--seed", str(seed), "--scale", f"{scale:.6g}", "--begin", str(begin)),
-        *("--step-length", f"{network.step_length:g}", *network.options),
+        *("--step-length", f"{files.step_length:g}", *files.options),
     ]
 
 
 def observe(
     libsumo: ModuleType,
-    network: SumoScenario,
+    files: SumoScenario,
     incidents: Sequence[Incident],
     seconds: Iterable[int],
 ) -> list[tuple[int, int, int, float]]:
@@ -285,14 +285,14 @@ def observe(
 
     Args:
         libsumo: the module, with a simulation.
-        network: the places of the record's columns.
+        files: the places of the record's columns.
         incidents: the incidents.
         seconds: the seconds of the record, which advance the simulation.
 
     Returns:
         A row for each vehicle and second: second, vehicle, column of the record, speed [km/h].
     """
-    places, vehicle = Places(network.columns), libsumo.vehicle
+    places, vehicle = Places(files.columns), libsumo.vehicle
     vehicles_on, position_of = libsumo.edge.getLastStepVehicleIDs, vehicle.getLanePosition
     limits = VehicleLimits(libsumo, incidents)
     numbers: dict[str, int] = {}
@@ -336,7 +336,7 @@ def tell_warnings(messages: Path, remark: Remark) -> None:
 class VehicleLimits:
     """Limits of incidents, for the vehicles on their segments.
 
-    Edges of one's own network may be much longer than a segment, so limits are not set on them: a
+    Edges of one's own net may be much longer than a segment, so limits are not set on them: a
     vehicle has one from the first second at which it is on the segment to the first at which it is
     not.
 
@@ -397,7 +397,7 @@ class Copied:
 
 
 def copy_input(path: Path, copy: Path, begin: float) -> Copied:
-    """Copy a network, routes or additional elements so that SUMO writes nothing and loses nobody.
+    """Copy a net, routes or additional elements so that SUMO writes nothing and loses nobody.
 
     No element of the copy names a file. Vehicles are in order of departure: in a file of routes
     SUMO drops vehicles, and starts flows late, that stand behind later ones.

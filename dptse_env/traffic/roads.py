@@ -35,7 +35,7 @@ _ENVIRONMENT = "environment"
 PARTS = ("action", "estimator", "observation", "privacy", "reward")
 """Keywords that take names of parts. In a file these are registered names: ``"module:Name"`` would
 let a file that somebody sent run code of the current folder."""
-_WITH_FOLDER = ("recordings", "network")
+_WITH_FOLDER = ("recordings", "sumo")
 _FILE_ENDINGS = (".json", ".safetensors")
 
 

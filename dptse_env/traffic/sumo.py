@@ -58,7 +58,7 @@ OPTIONS = (
     # Vehicles that stand still in a jam are not removed.
     "--time-to-teleport=-1",
 )
-"""Options on a network that is made for a corridor."""
+"""Options on a net that is made for a corridor."""
 
 _one_at_a_time = threading.Lock()
 
@@ -101,7 +101,7 @@ def simulate(corridor: Corridor, seed: int, remark: Remark = lambda text: None) 
     Args:
         corridor: The road.
         seed: The traffic seed.
-        remark: Takes what SUMO warns of on a network of one's own, and who does not depart.
+        remark: Takes what SUMO warns of on a net of one's own, and who does not depart.
 
     Raises:
         RecordingError: SUMO fails, the corridor's own files are missing or changed, or libsumo
@@ -111,10 +111,10 @@ def simulate(corridor: Corridor, seed: int, remark: Remark = lambda text: None) 
     """
     scenario = draw_scenario(corridor, seed)
     with running(corridor, scenario, remark) as libsumo:
-        if corridor.source.network is None:
+        if corridor.source.sumo is None:
             return _observe(libsumo, corridor, scenario)
         clock = seconds(libsumo, corridor, scenario)
-        rows = own_sumo.observe(libsumo, corridor.source.network, scenario.incidents, clock)
+        rows = own_sumo.observe(libsumo, corridor.source.sumo, scenario.incidents, clock)
     table = np.array(rows, dtype=np.float64).reshape(len(rows), 4).T
     step, vehicle, segment, speed = table[:, np.lexsort((table[2], table[0]))]
     return Record(
@@ -139,7 +139,7 @@ def running(
     if corridor.source.recordings is not None:
         cause = "its traffic is recorded, not simulated"
         raise RecordingError.from_cause(corridor, scenario.seed, cause)
-    network = network_xml(corridor.geometry) if corridor.source.network is None else ""
+    network = network_xml(corridor.geometry) if corridor.source.sumo is None else ""
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
         libsumo = _import_libsumo()
         if libsumo.isLoaded():
@@ -155,7 +155,7 @@ def running(
                 try:
                     libsumo.start(command)
                     yield libsumo
-                    if corridor.source.network is not None:
+                    if corridor.source.sumo is not None:
                         own_sumo.tell_departures(libsumo, remark)
                 finally:
                     if libsumo.isLoaded():
@@ -175,12 +175,12 @@ def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iter
     Yields:
         0, 1, ..., `corridor.duration`: the second [s] whose state libsumo holds.
     """
-    network, substeps, changes = corridor.source.network, SUBSTEPS, list[tuple[float, int, float]]()
-    if network is None:
+    files, substeps, changes = corridor.source.sumo, SUBSTEPS, list[tuple[float, int, float]]()
+    if files is None:
         changes = limit_changes(scenario.incidents, corridor.geometry.speed_limits)
     else:
-        substeps = network.substeps
-        for _ in range(network.warm_up * substeps):
+        substeps = files.substeps
+        for _ in range(files.warm_up * substeps):
             libsumo.simulationStep()
     yield 0
     for second in range(corridor.conditions.duration):
@@ -262,8 +262,8 @@ def _stderr_to(path: Path) -> Iterator[None]:
 
 def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario) -> list[str]:
     """Write SUMO's input files and return its command line."""
-    if corridor.source.network is not None:
-        return own_sumo.command(folder, corridor.source.network, scenario.sumo_seed, scenario.scale)
+    if corridor.source.sumo is not None:
+        return own_sumo.command(folder, corridor.source.sumo, scenario.sumo_seed, scenario.scale)
     network_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
     network_file.write_text(network, encoding="utf-8")
     route_file.write_text(routes_xml(corridor, scenario), encoding="utf-8")

@@ -67,7 +67,7 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
         "ramp_segments": 2,
         "ramp_length": 0.2,
         "ramp_speed_limit": 60.0,
-        "network": SumoScenario(
+        "sumo": SumoScenario(
             net="a.net.xml",
             routes=("a.rou.xml",),
             sha256=("0", "1"),

@@ -137,7 +137,7 @@ def _draft(
     # With slashes everywhere, so that a road file can be read on another system.
     names = tuple(Path(os.path.relpath(path.resolve(), folder)).as_posix() for path in paths)
     n_routes = len(files.routes)
-    network = SumoScenario(
+    sumo = SumoScenario(
         net=names[0],
         routes=names[1 : 1 + n_routes],
         additional=names[1 + n_routes :],
@@ -158,7 +158,7 @@ def _draft(
         geometry=road,
         conditions=Conditions(Demand(((0.0, 0.0),), (0.0,) * n_on), duration),
         scales=Scales.of(road),
-        source=Source(network=network),
+        source=Source(sumo=sumo),
         fixed_sensors=(N - 1, *(N + n_on + i for i in range(n_off))),
     )
 

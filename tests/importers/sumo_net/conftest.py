@@ -56,7 +56,7 @@ FLOWS = """
 
 
 def netconvert(folder: Path, nodes=NODES, edges=EDGES, connections=CONNECTIONS) -> Path:
-    """Compile plain XML; return the network file."""
+    """Compile plain XML; return the net file."""
     if importlib.util.find_spec("sumo") is None:
         pytest.skip("eclipse-sumo (extra corridors) is missing")
     import sumo
@@ -69,17 +69,17 @@ def netconvert(folder: Path, nodes=NODES, edges=EDGES, connections=CONNECTIONS) 
     ):
         (folder / name).write_text(text)
         command += [option, str(folder / name)]
-    network = folder / "road.net.xml"
-    subprocess.run([*command, "-o", str(network)], check=True, capture_output=True)
-    return network
+    net = folder / "road.net.xml"
+    subprocess.run([*command, "-o", str(net)], check=True, capture_output=True)
+    return net
 
 
 def motorway(folder: Path) -> Files:
     """Write the motorway and its traffic to a folder."""
-    network = netconvert(folder)
+    net = netconvert(folder)
     routes = folder / "road.rou.xml"
     routes.write_text(FLOWS)
-    return Files(network, (routes,), step_length=0.5)
+    return Files(net, (routes,), step_length=0.5)
 
 
 @pytest.fixture(scope="session")

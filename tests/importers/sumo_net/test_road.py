@@ -1,4 +1,4 @@
-"""Records of a network of one's own, against what SUMO says of it."""
+"""Records of a SUMO net of one's own, against what SUMO says of it."""
 
 import dataclasses
 import gzip
@@ -70,7 +70,7 @@ def test_routes_of_no_use_are_refused(files, tmp_path, content, message):
 def test_every_vehicle_on_the_path_and_its_ramps_is_counted_once(road):
     corridor = road.corridor
     limits = {}
-    for column in corridor.source.network.columns:
+    for column in corridor.source.sumo.columns:
         for edge, start, end in column:
             low, high = limits.get(edge, (np.inf, 0.0))
             limits[edge] = min(low, start), max(high, end)
@@ -115,11 +115,11 @@ def test_vehicles_pass_from_segment_to_segment_without_gaps(road):
 def test_the_record_is_that_of_the_generated_network_if_the_files_are_the_same(tmp_path):
     calm = SHORT_HIGHWAY.replaced(incident=None)
     scenario = draw_scenario(calm, 3)
-    network, routes = tmp_path / "short.net.xml", tmp_path / "short.rou.xml"
-    network.write_text(packaged_network("short-highway"))
+    net, routes = tmp_path / "short.net.xml", tmp_path / "short.rou.xml"
+    net.write_text(packaged_network("short-highway"))
     routes.write_bytes(ElementTree.tostring(_vehicles(calm, scenario)))
     files = Files(
-        network,
+        net,
         (routes,),
         step_length=0.5,
         options=("--no-internal-links", "--collision.action=none", "--time-to-teleport=-1"),
@@ -247,7 +247,7 @@ def test_an_incident_slows_the_vehicles_on_its_segment_alone(road):
 
 def test_a_warm_up_starts_the_record_with_traffic(files, road):
     warm = imported(files, warm_up=120)
-    assert warm.corridor.source.network.begin == 120
+    assert warm.corridor.source.sumo.begin == 120
     assert road.record.counts[0].sum() == 0
     np.testing.assert_array_equal(warm.record.counts[0], road.record.counts[120])
 
@@ -256,8 +256,8 @@ def test_an_incident_makes_no_vehicle_faster(files, road, tmp_path):
     slow = tmp_path / "slow.rou.xml"
     slow.write_text(FLOWS.replace('id="car"', 'id="car" maxSpeed="10"'))
     digests = file_digest(files.net), file_digest(slow)
-    network = dataclasses.replace(road.corridor.source.network, routes=(str(slow),), sha256=digests)
-    limited = road.corridor.replaced(network=network, incident=Incident(2, ((30, 200, 90.0),)))
+    sumo = dataclasses.replace(road.corridor.source.sumo, routes=(str(slow),), sha256=digests)
+    limited = road.corridor.replaced(sumo=sumo, incident=Incident(2, ((30, 200, 90.0),)))
     assert 30.0 < simulate(limited, 0).speed.max() <= 36.01
 
 
@@ -266,8 +266,8 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
     folder.mkdir()
     for path in (files.net, *files.routes):
         shutil.copy(path, folder)
-    network = dataclasses.replace(road.corridor.source.network, folder=str(folder))
-    corridor = road.corridor.replaced(network=network)
+    sumo = dataclasses.replace(road.corridor.source.sumo, folder=str(folder))
+    corridor = road.corridor.replaced(sumo=sumo)
     write_corridor(folder / "road.toml", corridor)
     assert str(tmp_path) not in (folder / "road.toml").read_text()
     assert read_corridor(folder / "road.toml") == corridor
@@ -280,7 +280,7 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
     write_corridor(tmp_path / "link.toml", corridor, {"bandwidth": 3})
     assert (read_corridor(below), "bandwidth" in below.read_text()) == (corridor, True)
     moved = read_corridor(folder.rename(there) / "road.toml")
-    assert Path(moved.source.network.folder) == there
+    assert Path(moved.source.sumo.folder) == there
     assert moved.digest == road.corridor.digest
     np.testing.assert_array_equal(simulate(moved, 0).counts, road.record.counts)
     published = moved.replaced(demand=moved.conditions.demand.scaled(2.0), lanes=4)
@@ -296,7 +296,7 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
 
 
 def test_scenarios_and_corridors_of_no_use_are_refused(road):
-    network = road.corridor.source.network
+    sumo = road.corridor.source.sumo
     for change, message in (
         ({"options": ("--fcd-output=all.xml",)}, "options must be options that change the traffic"),
         ({"options": ("-v",)}, "options must be --name=value each"),
@@ -305,11 +305,11 @@ def test_scenarios_and_corridors_of_no_use_are_refused(road):
         ({"columns": ((("in", 5.0, 5.0),),)}, r"columns\[0\] must be stretches that end"),
         ({"columns": ((("in", 0.0, 5.0),), (("in", 4.0, 9.0),))}, "without overlap on edge 'in'"),
     ):
-        with pytest.raises(ValueError, match=rf"network\..*{message}"):
-            dataclasses.replace(network, **change)
-    columns = network.columns[:-1]
-    with pytest.raises(ValueError, match=r"corridor\.network\.columns must be one for each of the"):
-        road.corridor.replaced(network=dataclasses.replace(network, columns=columns))
+        with pytest.raises(ValueError, match=rf"sumo\..*{message}"):
+            dataclasses.replace(sumo, **change)
+    columns = sumo.columns[:-1]
+    with pytest.raises(ValueError, match=r"corridor\.sumo\.columns must be one for each of the"):
+        road.corridor.replaced(sumo=dataclasses.replace(sumo, columns=columns))
     with pytest.raises(ValueError, match=r"corridor\.drivers must be left out"):
         road.corridor.replaced(drivers=Drivers("IDM"))
 

@@ -8,11 +8,11 @@ from dptse_env.importers.sumo_net import Files, segment_path
 from tests.importers.sumo_net.conftest import CONNECTIONS, EDGES, NODES, PATH, netconvert
 
 
-def lengths_of_edges(network):
+def lengths_of_edges(net):
     """Return the length of every edge, internal ones included [m]."""
     return {
         edge.get("id"): max(float(lane.get("length")) for lane in edge.iter("lane"))
-        for edge in ElementTree.parse(network).iter("edge")
+        for edge in ElementTree.parse(net).iter("edge")
     }
 
 
@@ -90,8 +90,8 @@ def test_a_lay_by_is_an_off_ramp_and_an_on_ramp_on_either_half(tmp_path):
         '<connection from="merge" to="lay-by" fromLane="0" toLane="0"/>'
         '<connection from="lay-by" to="bend" fromLane="0" toLane="0"/></connections>',
     )
-    network = netconvert(tmp_path, NODES, edges, connections)
-    segments = segment_path(Files(network, ()), PATH, 100.0)
+    net = netconvert(tmp_path, NODES, edges, connections)
+    segments = segment_path(Files(net, ()), PATH, 100.0)
     assert segments.names == ("ramp-b", "lay-by", "lay-by", "exit-a")
     N = segments.geometry.n_mainline
     joining, leaving = segments.columns[N + 1], segments.columns[N + 2]
