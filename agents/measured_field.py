@@ -16,11 +16,10 @@ import numpy as np
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.evaluation import WARM_UP
-from dptse_env.importers.fields import FieldSource, by_second
+from dptse_env.importers.fields import FieldRoad, FieldSource, by_second
 from dptse_env.parts import make_model, make_release
-from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Scales
+from dptse_env.traffic import Corridor, Demand
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.units import HOUR
 from dptse_env.utils.validation import require
 
 
@@ -64,17 +63,11 @@ def read_field(source: FieldSource, segments: int, lanes: int, speed_limit: floa
 
 def field_corridor(field: Field, lanes: int, speed_limit: float) -> Corridor:
     """Return a straight road for a field; scales grow with lanes and limit as on other roads."""
-    n = field.density.shape[1] - 2
-    dwell = HOUR * field.segment_length / float(field.speed[:, 1:-1].mean())
-    demand = Demand(mainline=((0.0, float((field.density * field.speed)[:, 0].mean())),))
-    geometry = Geometry(
-        n, lanes=lanes, segment_length=field.segment_length, speed_limit=speed_limit
-    )
-    return Corridor(
-        "measured-field",
-        geometry,
-        Conditions(demand, duration=len(field.density)),
-        Scales.of(geometry, dwell),
+    road = FieldRoad("measured-field", field.density.shape[1] - 2, lanes, speed_limit)
+    entering = float((field.density * field.speed)[:, 0].mean())
+    return road.corridor(field.segment_length, len(field.density)).replaced(
+        demand=Demand(mainline=((0.0, entering),)),
+        average_dwell=3600.0 * field.segment_length / float(field.speed[:, 1:-1].mean()),
     )
 
 
