@@ -139,12 +139,6 @@ class NoUpdate(Estimator):
     def _estimate(self): ...
 
 
-class NoInnovations(parts.Smoothed):
-    def __init__(self, model, n_episodes, settings):
-        super().__init__(model, n_episodes, settings)
-        self.innovations = None
-
-
 class Nan(parts.Smoothed):
     def _estimate(self):
         return Estimate(*[np.full_like(self.traffic[..., 0], np.nan)] * 4)
@@ -198,7 +192,6 @@ BAD = [
     ("make", {"privacy": NoUpdate}, r"privacy\.preset .*:NoUpdate must be a subclass of"),
     ("make", {"observation": ["default", Clash]}, "observation .*:Clash must not be named 'age'"),
     ("make", UNKNOWN, "estimator_settings.gain is unknown; allowed"),
-    ("reset", {"estimator": NoInnovations}, "estimator .*:NoInnovations must .* 'innovations'"),
     ("reset", {"estimator": Nan}, r"estimator .*:Nan.estimate\(\) must .* 'density' .* got nan in"),
     ("reset", {"observation": [BlockOfNan]}, r"observation .*BlockOfNan.values\(\) must .* finite"),
     ("reset", {"reward": scalar_reward}, r"reward .*:scalar_reward must .* shape \(1,\)"),

@@ -17,7 +17,7 @@ from dptse_env.estimators.settings import (
 )
 from dptse_env.estimators.tuned import load_settings
 from dptse_env.model import ARZModel
-from dptse_env.utils.registry import Registry, is_foreign
+from dptse_env.utils.registry import Registry
 from dptse_env.utils.validation import shown
 
 __all__ = [
@@ -152,8 +152,7 @@ def make_estimator(
     Raises:
         MissingExtraError: The backend is `reference` and its libraries are not installed.
         ValueError: Name or backend is unknown, the estimator does not have the backend, there are
-            no episodes, a setting is out of range on this road, or the estimator lacks a method or
-            an attribute.
+            no episodes, a setting is out of range on this road, or the estimator lacks a method.
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be >= 1, got {n_episodes}")
@@ -163,8 +162,6 @@ def make_estimator(
     reference = backend == "reference"
     part: Any = resolve_name(REFERENCES[estimator]) if reference else ESTIMATORS.find(estimator)
     made: Estimator = part(with_demand(model, settings), n_episodes, settings)
-    if is_foreign(made):
-        made.check_arrays()
     return made
 
 

@@ -264,26 +264,6 @@ class Estimator(ABC):
     def _estimate(self) -> Estimate:
         """Return the estimate of all episodes in fresh arrays."""
 
-    def check_arrays(self) -> None:
-        """Refuse arrays of other shapes than `Estimator` has, and an estimate that is not sound.
-
-        Raises:
-            ValueError: There are such arrays; see `check_estimate`.
-        """
-        shapes = {
-            "innovations": (self.n_episodes, self.model.channels.size, 2),
-            "diverged": (self.n_episodes,),
-            "fallback": (self.n_episodes,),
-        }
-        for name, shape in shapes.items():
-            found: Any = getattr(self, name)
-            if np.shape(found) != shape:
-                raise ValueError(
-                    f"estimator {name_of_class(self)} must have an array {name!r} of shape "
-                    f"{shape}, got shape {np.shape(found)}"
-                )
-        self.check_estimate(self.estimate())
-
     def check_estimate(self, estimate: Estimate) -> None:
         """Refuse an estimate that is not finite or not of shape (n, S).
 
