@@ -9,6 +9,7 @@ from typing import Any
 
 import griffe
 
+from dptse_env.traffic.corridor import PARTS, Corridor
 from dptse_env.utils.validation import Interval, allowed_numbers
 from scripts.dptse import GROUPS, MODULES
 
@@ -20,7 +21,13 @@ def keyword_table(path: str) -> str:
         path: Import path of the class.
     """
     module, _, name = path.rpartition(".")
-    cls = getattr(import_module(module), name)
+    lines = ["| keyword | values | default | meaning |", "| :-- | :-- | :-- | :-- |"]
+    lines += _rows(getattr(import_module(module), name))
+    return "\n".join(['<div class="keywords" markdown>', "", *lines, "", "</div>"])
+
+
+def _rows(cls: Any) -> list[str]:
+    """Return a line for each field; parts of a corridor have those of their own fields."""
     hints = typing.get_type_hints(cls, include_extras=True)
     meanings = {
         each.name: " ".join(each.description.split())
@@ -28,12 +35,14 @@ def keyword_table(path: str) -> str:
         if section.kind is griffe.DocstringSectionKind.attributes
         for each in section.value
     }
-    lines = ["| keyword | values | default | meaning |", "| :-- | :-- | :-- | :-- |"]
+    rows = []
     for field in dataclasses.fields(cls):
-        if field.name in meanings and field.compare:  # else `resolve` fills it in
+        if cls is Corridor and field.name in PARTS:
+            rows += _rows(hints[field.name])
+        elif field.name in meanings and field.compare:  # else `resolve` fills it in
             allowed, meaning = values(hints[field.name]), meanings[field.name]
-            lines.append(f"| `{field.name}` | {allowed} | {default(field)} | {meaning} |")
-    return "\n".join(['<div class="keywords" markdown>', "", *lines, "", "</div>"])
+            rows.append(f"| `{field.name}` | {allowed} | {default(field)} | {meaning} |")
+    return rows
 
 
 def values(hint: Any) -> str:

@@ -98,7 +98,7 @@ def test_highways_differ_in_everything_that_roads_differ_in():
     lanes = {count for each in highways for count in each.geometry.segment_lanes}
     assert lanes == set(range(1, 7))
     limits, lengths = (
-        [value for each in highways for value in getattr(each, name)]
+        [value for each in highways for value in getattr(each.geometry, name)]
         for name in ("speed_limits", "segment_lengths")
     )
     assert (min(limits), max(limits)) == LIMITS
