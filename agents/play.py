@@ -14,7 +14,7 @@ from filelock import FileLock
 from agents.environments import make_config, make_vector, quietly
 from agents.policies import NamedSchedule, find_policy
 from agents.watchers import WATCHERS
-from dptse_env.estimators.recurrent import member_for, read_network, shipped_networks
+from dptse_env.estimators.recurrent import member_for, read_weights, shipped_weights
 from dptse_env.evaluation import WARM_UP, Row, evaluate
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.traffic import Corridor, RecordLibrary, Records, open_library
@@ -114,9 +114,9 @@ class Cell:
 
 
 def _with_digests(value: Any) -> Any:
-    """Return plain JSON with digests in place of files' names, and beside those of networks.
+    """Return plain JSON with digests in place of files' names, and beside those of weights.
 
-    That is a network of the package by its own name. A pair's name stands alone, as it stands in
+    That are weights of the package by their own name. A pair's name stands alone, as it stands in
     rows from before.
     """
     if isinstance(value, Mapping):
@@ -124,8 +124,8 @@ def _with_digests(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_with_digests(each) for each in value]
     if isinstance(value, str):
-        if value in shipped_networks():
-            return f"{value} sha256:{read_network(value).card['sha256']}"
+        if value in shipped_weights():
+            return f"{value} sha256:{read_weights(value).card['sha256']}"
         members = dict.fromkeys(member_for(value, flows) for flows in (True, False))
         files = [member for member in members if Path(member).is_file()]
         return "+".join(f"sha256:{file_digest(file)}" for file in files) or value

@@ -15,7 +15,7 @@ __version__ = "0.3.0.dev0"
 PACKAGE = Path(__file__).parent
 
 KINDS = (".json", ".py", ".safetensors", ".xml")
-"""Endings of the files that move numbers: code, settings, weights and networks."""
+"""Endings of the files that move numbers: code, settings, weights and SUMO nets."""
 
 LEFT_OUT = (
     "__init__.py", "versions.py", "command_line.py", "rendering.py", "importers/*", "_tools/*",

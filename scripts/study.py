@@ -52,7 +52,7 @@ class Args(Machines):
     training_seeds: str = "0:5"
     """Seeds of these trainings, first:stop: every learner has the first, the best two all."""
     weights: tuple[str, ...] = ()
-    """Networks for the studies of roads and estimators: names, or paths without
+    """Weights for the studies of roads and estimators: names, or paths without
     "-flows.safetensors" and "-speeds.safetensors"; need another output."""
     output: Path | None = None
     """Folder of the results; results/NAME if not given, with "-quick" for quick ones."""

@@ -2,11 +2,11 @@ r"""Train recurrent networks as an estimator, for releases of flows and of speed
 
 dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --seeds 0:1 \
     --rounds own:2:4 own:2:4 --traffic 0:2 --validation 1000:1001 \
-    --output results/network \
+    --output results/weights \
     --plan '{"windows": 2, "ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}'
 
-Each kind and seed is a training in a folder of its own. The best network of each kind on validation
-traffic becomes network-flows.safetensors and network-speeds.safetensors in the output folder, a
+Each kind and seed is a training in a folder of its own. The best weights of each kind on validation
+traffic become weights-flows.safetensors and weights-speeds.safetensors in the output folder, a
 pair that the environment takes with the keywords that the command prints. A folder also has
 progress.csv (the learning curve), plan.json (the settings) and checkpoint.pt. The same command goes
 on from the last checkpoints to the same numbers.
@@ -37,15 +37,15 @@ from agents.play import record
 from agents.terminal import make_table, print_table
 from agents.training.run_files import PLAN, PROGRESS, Row, check_plan, read_progress
 from dptse_env.config import parse_seeds
-from dptse_env.estimators.recurrent import member_for, read_network
+from dptse_env.estimators.recurrent import member_for, read_weights
 from dptse_env.utils.files import replacing, require_output
 from dptse_env.utils.validation import from_mapping, parse_json, require
 from scripts.cli import Machines
 
-NAME = "network"
-"""Name of the pair of networks in the output folder."""
+NAME = "weights"
+"""Name of the pair of weights in the output folder."""
 CONTINUED: dict[str, Any] = {"learning_rate": 1.5e-3, "teacher": 0.5}
-"""Fields of a plan that begins with trained networks."""
+"""Fields of a plan that begins with trained weights."""
 GLANCE = 5.0
 """Time between two looks at the learning curves [s]."""
 
@@ -57,7 +57,7 @@ class Args(Machines):
     kinds: tuple[Kind, ...] = ("flows", "speeds")
     """Kinds of releases: flows (capped, paced), or speeds (paper, corrected)."""
     seeds: str = "0:3"
-    """Training seeds, first:stop; the best network on validation traffic is taken."""
+    """Training seeds, first:stop; the best weights on validation traffic are taken."""
     env: tuple[str, ...] = ()
     """Environments to train in, each an id or 'id {keywords as JSON}', beside sections of random
     highways; nine roads if not given."""
@@ -70,10 +70,10 @@ class Args(Machines):
     rounds: tuple[str, ...] = ("own:96:64",) * 7
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
     initial: str | None = "highway"
-    """Pair of networks to begin with, which also teaches; None for random weights."""
+    """Pair of weights to begin with, which also teaches; None for random ones."""
     plan: str = "{}"
     """Further fields of the plan (agents/filters/plan.py) as JSON."""
-    output: Path = Path("results/network")
+    output: Path = Path("results/weights")
     """Folder of the trainings."""
 
 
@@ -113,7 +113,7 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
         validation_envs=args.validation_env,
         ranges=ranges,
         rounds=tuple(parse_round(each) for each in args.rounds),
-        width=FilterPlan.width if initial is None else read_network(initial).network.width,
+        width=FilterPlan.width if initial is None else read_weights(initial).weights.width,
         windows=min(FilterPlan.windows, len(traffic)),
         seconds=min(FilterPlan.seconds, *(road.conditions.duration for road in roads)),
         initial=initial,
@@ -123,7 +123,7 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
 
 
 def main(args: Args) -> None:
-    """Record missing traffic, train, and print the keywords that take the networks."""
+    """Record missing traffic, train, and print the keywords that take the weights."""
     seeds = parse_seeds(args.seeds)
     require(bool(args.kinds), "kinds", "one or more", args.kinds)
     tasks = [

@@ -247,8 +247,8 @@ def policies(rng, folder):
 
 def weights(rng, folder):
     """Draw the file of a recurrent network, and play with it."""
-    shipped = sorted((SHIPPED / "estimators" / "networks").glob("*.safetensors"))
-    path = folder / "network.safetensors"
+    shipped = sorted((SHIPPED / "estimators" / "weights").glob("*.safetensors"))
+    path = folder / "weights.safetensors"
     path.write_bytes(changed_tensors(one_of(shipped, rng), rng))
     settings = {"recurrent": {"weights": str(path)}}
     keywords = {"estimator": "recurrent", "estimator_settings": settings, "traffic_seeds": [0]}

@@ -13,7 +13,7 @@ from dptse_env.estimators.recurrent_kernels import (
     HIGHEST_SPREAD,
     LOWEST_SPREAD,
     SPEED_RANGE,
-    Network,
+    Weights,
     message_width,
     shapes,
 )
@@ -96,19 +96,19 @@ class RecurrentNetwork(nn.Module):
         raw = h @ self.heads + self.heads_bias
         return _outputs(roads, raw[..., :4]), _outputs(roads, raw[..., 4:])
 
-    def take(self, weights: Network) -> None:
+    def take(self, weights: Weights) -> None:
         """Take weights of the same width."""
         with torch.no_grad():
             for name, parameter in self.named_parameters():
                 parameter.copy_(torch.from_numpy(getattr(weights, name).copy()))
 
-    def weights(self) -> Network:
+    def weights(self) -> Weights:
         """Return the weights as arrays."""
         arrays: dict[str, Any] = {
             name: np.ascontiguousarray(parameter.detach().numpy().copy())
             for name, parameter in self.named_parameters()
         }
-        return Network(**arrays)
+        return Weights(**arrays)
 
 
 def _outputs(roads: Roads, raw: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ def second_loss(
 
 
 def teacher_loss(roads: Roads, estimated: Tensor, taught: Tensor) -> Tensor:
-    """Return how far estimates are from those of another network, averaged over all cells.
+    """Return how far estimates are from those of a teacher, averaged over all cells.
 
     Ten times the squared difference of means, on the scale of errors, and 0.03 times that of the
     logarithms of deviations. Both arguments have shape (..., C, 4).

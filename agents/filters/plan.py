@@ -1,6 +1,6 @@
 """Plan of the training of a recurrent network: rounds of scenarios, and passes over them.
 
-The plan decides all numbers of a training, and says on the card of the network what it was.
+The plan decides all numbers of a training, and says on the card of the weights what it was.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from agents.filters.scenarios import MECHANISMS, PRIVATE, Kind, Scenario, Scenar
 from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.estimators.recurrent import FORMAT, read_network
+from dptse_env.estimators.recurrent import FORMAT, read_weights
 from dptse_env.estimators.recurrent_kernels import CHANNELS
 from dptse_env.utils.validation import Interval, checked_fields, integer, require
 from dptse_env.versions import versions_with
@@ -55,7 +55,7 @@ OWN = "own"
 
 
 def played_by(weights: Path) -> dict[str, Any]:
-    """Return the keywords of an environment whose estimator is a network, given as a file."""
+    """Return the keywords of an environment whose estimator has weights of a file."""
     settings = {"recurrent": {"weights": str(weights.resolve())}}
     return {"estimator": "recurrent", "estimator_settings": settings}
 
@@ -103,10 +103,10 @@ class FilterPlan:
         prediction: Weight of the loss of predictions.
         clip_norm: Largest norm of a gradient.
         checkpoint_every: Passes between checkpoints.
-        initial: Network whose weights the training begins with, a name or a file; None for weights
-            drawn at random.
-        teacher: Part of the loss on ordinary roads that holds the network to what the initial one
-            says there.
+        initial: Weights that the training begins with, a name or a file; None to draw them at
+            random.
+        teacher: Part of the loss on ordinary roads that holds the network to what it says there
+            with the initial weights.
 
     Raises:
         ValueError: A value is out of range.
@@ -153,14 +153,14 @@ class FilterPlan:
         require(apart, "validation_highways", allowed, self.validation_highways)
         if not self.rounds or (self.initial is None and self.rounds[0].estimator == OWN):
             raise ValueError(
-                "rounds must begin with one of another estimator where no initial network is "
+                "rounds must begin with one of another estimator where no initial weights are "
                 "given, since the network knows nothing yet"
             )
         taught = self.initial is not None or self.teacher == 0.0
-        require(taught, "teacher", "0 without an initial network", self.teacher)
+        require(taught, "teacher", "0 without initial weights", self.teacher)
         if self.initial is not None:
-            width = read_network(self.initial).network.width
-            allowed = f"that of the initial network, {width}"
+            width = read_weights(self.initial).weights.width
+            allowed = f"that of the initial weights, {width}"
             require(self.width == width, "width", allowed, self.width)
 
     @property
@@ -191,7 +191,7 @@ class FilterPlan:
         """Return the plan as plain JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
         if self.initial is not None:
-            plain["initial_sha256"] = read_network(self.initial).card["sha256"]
+            plain["initial_sha256"] = read_weights(self.initial).card["sha256"]
         return plain
 
     def validation_sections(self) -> list[Section]:
@@ -225,7 +225,7 @@ class FilterPlan:
         return cells
 
     def card(self, done: int, name: str) -> dict[str, Any]:
-        """Return the card of a network after `done` passes: what it was trained on."""
+        """Return the card of the weights after `done` passes: what they were trained on."""
         ranges = self.ranges
         roads = [make_config(*parse_env(each)).corridor for each in ranges.envs]
         found: dict[str, list[float]] = {

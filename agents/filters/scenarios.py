@@ -17,7 +17,7 @@ from agents.filters.highways import SEGMENTS, Section, draw_highway
 from dptse_env.utils.validation import Interval, checked_fields, require
 
 Kind = Literal["flows", "speeds"]
-"""Kind of the numbers that are released beside densities; a network knows one kind."""
+"""Kind of the numbers that are released beside densities; weights are for one kind."""
 MECHANISMS: dict[Kind, tuple[str, ...]] = {
     "flows": ("capped", "paced"), "speeds": ("paper", "corrected"),
 }  # fmt: skip

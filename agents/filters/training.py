@@ -25,14 +25,14 @@ from agents.training.run_files import (
     write_checkpoint,
     write_progress,
 )
-from dptse_env.estimators.recurrent import read_network, write_network
+from dptse_env.estimators.recurrent import read_weights, write_weights
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE
 from dptse_env.importers.folder import ROAD, new_folder
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import FloatArray
 
-WEIGHTS, PLAYED = "network.safetensors", "played.safetensors"
-"""The trained network, and the network that the scenarios of a round are collected with."""
+WEIGHTS, PLAYED = "weights.safetensors", "played.safetensors"
+"""The trained weights, and those that the scenarios of a round are collected with."""
 SECTIONS = "sections"
 """Folder of the sections to validate on."""
 AVERAGING = 0.998
@@ -79,7 +79,7 @@ class FilterTraining:
 
     A training that was killed continues from its last checkpoint to the same numbers, on the same
     machine with the same number of torch's threads. Scenarios are not stored: they are collected
-    again, with the network that played them at first.
+    again, with the weights that played them at first.
 
     Attributes:
         plan: The plan.
@@ -119,7 +119,7 @@ class FilterTraining:
         torch.manual_seed(plan.seed)
         self.network = RecurrentNetwork(plan.width)
         if plan.initial is not None:
-            self.network.take(read_network(plan.initial).network)
+            self.network.take(read_weights(plan.initial).weights)
         self._optimiser = torch.optim.Adam(self.network.parameters(), plan.learning_rate)
         self._average = copy.deepcopy(self.network)
         self._teacher = copy.deepcopy(self.network) if plan.teacher > 0.0 else None
@@ -135,7 +135,7 @@ class FilterTraining:
                 self._watch(row)
 
     def run(self) -> None:
-        """Train to the end of the plan, and leave the network beside the checkpoint."""
+        """Train to the end of the plan, and leave the weights beside the checkpoint."""
         last = 0
         for index, each in enumerate(self.plan.rounds):
             first, last = last, last + each.passes
@@ -244,7 +244,7 @@ class FilterTraining:
 
     def _save(self, name: str) -> None:
         card = self.plan.card(self.done, self.folder.name)
-        write_network(self.folder / name, self._average.weights(), card)
+        write_weights(self.folder / name, self._average.weights(), card)
 
     def _keep(self) -> None:
         content = {

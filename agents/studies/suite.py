@@ -69,8 +69,8 @@ SEEDS, LONG_SEEDS = parse_seeds("2500:2532"), parse_seeds("2500:2508")
 """Test traffic of no other study: of roads of up to 15 segments, and of the long road."""
 
 _EKF: Mapping[str, Any] = {"estimator": "ekf"}
-# A single network by its name is part of what a cell is, so that rows of other weights are others.
-_NETWORK: Mapping[str, Any] = {
+# Weights by their name are part of what a cell is, so that rows of other weights are others.
+_RECURRENT: Mapping[str, Any] = {
     "estimator": "recurrent",
     "estimator_settings": {"recurrent": {"weights": "highway-flows"}},
 }
@@ -110,11 +110,11 @@ def _cell(
 
 CELLS = {
     "short": _cell(SHORT, 1, _EKF),
-    "short-paced": _cell(SHORT, 1, _NETWORK, _SHORT_PACED),
+    "short-paced": _cell(SHORT, 1, _RECURRENT, _SHORT_PACED),
     "paper": _cell(PAPER, 5, _EKF),
     "capped": _cell(PRIVATE, 5, _EKF, {"privacy": "capped"}),
     "paced": _cell(PRIVATE, 1, _EKF),
-    "paced-recurrent": _cell(PRIVATE, 1, _NETWORK),
+    "paced-recurrent": _cell(PRIVATE, 1, _RECURRENT),
     "strict": _cell(PRIVATE, 2, _EKF, {"delta": 1e-6}),
     "connected": _cell(PAPER, 2, _EKF, {"penetration": 0.1}),
     "elsewhere": _cell(PRIVATE, 1, _EKF, _ELSEWHERE),

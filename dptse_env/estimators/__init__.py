@@ -140,8 +140,8 @@ def make_estimator(
 
     Args:
         estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `blend` (a mean
-            of EKF and random walk), `open_loop` (no measurements), `recurrent` (a network), `asm`
-            (adaptive smoothing), `mixture` (of others), a registered name,
+            of EKF and random walk), `open_loop` (no measurements), `recurrent` (a neural network),
+            `asm` (adaptive smoothing), `mixture` (of others), a registered name,
             ``"package.module:Class"`` or a class.
         backend: `compiled` (numba), or `reference` (filterpy, qpsolvers, numpy), which EKF, UKF,
             EnKF and MHE have.

@@ -62,7 +62,7 @@ class Mixture(Estimator):
     def inherits(
         cls, road: Road, flows: bool, largest_span: int, settings: EstimatorSettings
     ) -> tuple[str, ...]:
-        """Return the setting of the experts where no network was trained on such roads."""
+        """Return the setting of the experts where no weights were trained on such roads."""
         found = [
             bool(kind.inherits(road, flows, largest_span, own))
             for kind, own in _experts(settings)
@@ -142,7 +142,7 @@ class Mixture(Estimator):
 
 
 def _experts(settings: EstimatorSettings) -> list[tuple[type[Estimator], EstimatorSettings]]:
-    """Return the classes and settings of the experts; a name that is no estimator's is a network's.
+    """Return the classes and settings of the experts; other names are those of weights.
 
     Raises:
         ValueError: An estimator cannot be found.

@@ -1,7 +1,7 @@
 """A recurrent network as an estimator, trained on simulated traffic.
 
-Its weights are files (`read_network`): the arrays of a `Network`, and a card that says what the
-network was trained on.
+Its weights are files (`read_weights`): the arrays `Weights`, and a card that says what traffic
+they were trained on.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from dptse_env.estimators.recurrent_kernels import (
     CHANNELS,
     LONGEST_AGE,
     Memory,
-    Network,
     State,
+    Weights,
     make_cells,
     predict,
     restart,
@@ -43,7 +43,7 @@ FORMAT = "recurrent-2"
 SHIPPED = ("highway", "long-highway", "roads")
 """Pairs that come with the package, each trained on more kinds of roads than those before it."""
 
-_FOLDER, _SUFFIX = Path(__file__).parent / "networks", ".safetensors"
+_FOLDER, _SUFFIX = Path(__file__).parent / "weights", ".safetensors"
 
 
 class Recurrent(KernelEstimator):
@@ -55,7 +55,7 @@ class Recurrent(KernelEstimator):
     different cells and of density and speed count as independent.
 
     Attributes:
-        saved: The network in force, with its card.
+        saved: The weights in force, with their card.
         hidden: Hidden states, shape (n, S, H).
     """
 
@@ -68,7 +68,7 @@ class Recurrent(KernelEstimator):
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
         flows = model.centre is not None
-        self.saved = network_for(settings.recurrent.weights, model.road, flows)
+        self.saved = weights_for(settings.recurrent.weights, model.road, flows)
         S, n = model.n_segments, n_episodes
         self._memory = Memory(
             inputs=np.zeros((n, model.n_inputs)),
@@ -77,7 +77,7 @@ class Recurrent(KernelEstimator):
             innovations=self.innovations,
         )
         self._state = State(
-            hidden=np.zeros((n, S, self.saved.network.width), dtype=np.float32),
+            hidden=np.zeros((n, S, self.saved.weights.width), dtype=np.float32),
             ahead=np.zeros((n, S, 4)),
             priors=np.zeros((n, S, 4)),
             diverged=self.diverged,
@@ -87,7 +87,7 @@ class Recurrent(KernelEstimator):
         self._memory.present[:] = self._state.priors
         self.hidden = self._state.hidden
         self.arrays = Bundle(
-            model.road, model.channels, make_cells(model), self._memory, self.saved.network,
+            model.road, model.channels, make_cells(model), self._memory, self.saved.weights,
             self._state,
         )  # fmt: skip
 
@@ -95,7 +95,7 @@ class Recurrent(KernelEstimator):
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
         """Refuse weights that are missing or cannot be read."""
         flows = model.centre is not None
-        network_for(settings.recurrent.weights, model.road, flows)
+        weights_for(settings.recurrent.weights, model.road, flows)
 
     @classmethod
     def inherits(
@@ -109,7 +109,7 @@ class Recurrent(KernelEstimator):
             largest_span: Largest number of segments of a query.
             settings: The settings.
         """
-        saved = network_for(settings.recurrent.weights, road, flows)
+        saved = weights_for(settings.recurrent.weights, road, flows)
         is_outside = outside(saved, road, flows, largest_span)
         return ("estimator_settings.recurrent.weights",) if is_outside else ()
 
@@ -129,8 +129,8 @@ class Recurrent(KernelEstimator):
         return Estimate(*(self._memory.present[..., j].copy() for j in range(4)))
 
 
-def outside(saved: SavedNetwork, road: Road, flows: bool, largest_span: int) -> list[str]:
-    """Return the properties of a road and its releases that a network was not trained on."""
+def outside(saved: SavedWeights, road: Road, flows: bool, largest_span: int) -> list[str]:
+    """Return the properties of a road and its releases that weights were not trained on."""
     found: dict[str, Sequence[float]] = {
         "n_mainline": (road.n_mainline,),
         "segment_length": road.lengths.tolist(),
@@ -147,70 +147,70 @@ def outside(saved: SavedNetwork, road: Road, flows: bool, largest_span: int) -> 
 
 
 @dataclass(frozen=True)
-class SavedNetwork:
-    """A network with its card.
+class SavedWeights:
+    """Weights with their card.
 
     Attributes:
-        network: The weights.
+        weights: The arrays.
         card: ``name``, ``format``, ``channels``, ``ranges``, ``training``, and ``sha256`` of the
             content.
-        source: The file, or the name of a network that comes with the package.
+        source: The file, or the name of weights that come with the package.
     """
 
-    network: Network
+    weights: Weights
     card: Mapping[str, Any]
     source: str
 
 
-def network_for(weights: str | None, road: Road, flows: bool) -> SavedNetwork:
-    """Return the network of a setting for a road: of `SHIPPED` the first that suits it, if None.
+def weights_for(source: str | None, road: Road, flows: bool) -> SavedWeights:
+    """Return the weights of a setting for a road: of `SHIPPED` the first that suit it, if None.
 
     Args:
-        weights: The setting, see `RecurrentSettings`.
+        source: The setting `RecurrentSettings.weights`.
         road: The road.
         flows: Whether flows are released, not speeds.
 
     Raises:
-        ValueError: See `read_network`.
+        ValueError: See `read_weights`.
     """
-    if weights is not None:
-        return read_network(member_for(weights, flows))
+    if source is not None:
+        return read_weights(member_for(source, flows))
     members = (member_for(name, flows) for name in SHIPPED)
-    for saved in (read_network(each) for each in members if each in shipped_networks()):
+    for saved in (read_weights(each) for each in members if each in shipped_weights()):
         if not outside(saved, road, flows, 1):
             break
     return saved
 
 
 @cache
-def shipped_networks() -> tuple[str, ...]:
-    """Return the names of the networks that come with the package."""
+def shipped_weights() -> tuple[str, ...]:
+    """Return the names of the weights that come with the package."""
     return tuple(sorted(path.stem for path in _FOLDER.glob(f"*{_SUFFIX}")))
 
 
 def member_for(source: str, flows: bool) -> str:
-    """Return the network of a pair that suits releases of flows, or of speeds.
+    """Return the member of a pair of weights that suits releases of flows, or of speeds.
 
-    A pair is two networks whose names, or files, are ``<source>-flows`` and ``<source>-speeds``. A
-    name or file of a single network is returned as it is.
+    The names, or files, of a pair are ``<source>-flows`` and ``<source>-speeds``. The name or file
+    of a single member is returned as it is.
     """
     member = f"{source}-{'flows' if flows else 'speeds'}"
-    if member in shipped_networks():
+    if member in shipped_weights():
         return member
     return f"{member}{_SUFFIX}" if Path(f"{member}{_SUFFIX}").is_file() else source
 
 
-def read_network(source: str) -> SavedNetwork:
-    """Read a network, given by name or as a file.
+def read_weights(source: str) -> SavedWeights:
+    """Read weights, given by name or as a file.
 
     Raises:
-        ValueError: There is no such name or file, or it is no saved network, or damaged.
+        ValueError: There is no such name or file, or it holds no weights, or is damaged.
     """
-    if source in shipped_networks():
+    if source in shipped_weights():
         return _shipped(source)
     if not Path(source).is_file():
-        names = {name.removesuffix("-flows") for name in shipped_networks()}
-        known = ", ".join(sorted(names.union(shipped_networks())))
+        names = {name.removesuffix("-flows") for name in shipped_weights()}
+        known = ", ".join(sorted(names.union(shipped_weights())))
         raise ValueError(
             f"estimator_settings.recurrent.weights must be a file or one of {known}, got {source!r}"
         )
@@ -218,32 +218,32 @@ def read_network(source: str) -> SavedNetwork:
 
 
 @cache
-def _shipped(name: str) -> SavedNetwork:
+def _shipped(name: str) -> SavedWeights:
     return _read(_FOLDER / f"{name}{_SUFFIX}", name)
 
 
-def _read(path: Path, source: str) -> SavedNetwork:
+def _read(path: Path, source: str) -> SavedWeights:
     card, arrays = read_tensors(path)
     try:
-        return SavedNetwork(_checked(arrays, card), card, source)
+        return SavedWeights(_checked(arrays, card), card, source)
     except ValueError as problem:
-        raise ValueError(f"{source} is not a saved network: {problem!s:.300}") from problem
+        raise ValueError(f"{source} is not a file of weights: {problem!s:.300}") from problem
 
 
-def write_network(path: str | os.PathLike[str], network: Network, card: Mapping[str, Any]) -> None:
-    """Write a network with its card; the same arrays and card give the same bytes.
+def write_weights(path: str | os.PathLike[str], weights: Weights, card: Mapping[str, Any]) -> None:
+    """Write weights with their card; the same arrays and card give the same bytes.
 
     Raises:
-        ValueError: The network or its card has another layout; nothing is written.
+        ValueError: The arrays or their card have another layout; nothing is written.
         OSError: The file cannot be written; what was there stays.
     """
-    arrays = network._asdict()
+    arrays = weights._asdict()
     _checked(arrays, card)
     write_tensors(path, arrays, card)
 
 
-def _checked(arrays: Mapping[str, AnyArray], card: Mapping[str, Any]) -> Network:
-    """Return the network of a file's arrays and card, or refuse them."""
+def _checked(arrays: Mapping[str, AnyArray], card: Mapping[str, Any]) -> Weights:
+    """Return the weights of a file's arrays and card, or refuse them."""
     if card.get("format") != FORMAT or card.get("channels") != list(CHANNELS):
         raise ValueError(
             f"it has channels of format {card.get('format')!r}, this version reads {FORMAT!r}"
@@ -259,4 +259,4 @@ def _checked(arrays: Mapping[str, AnyArray], card: Mapping[str, Any]) -> Network
     if not 1 <= width <= LARGEST_WIDTH:
         raise ValueError(f"its width must be in 1..{LARGEST_WIDTH}, got {width}")
     require_arrays(arrays, shapes(width), np.float32)
-    return Network(**arrays)
+    return Weights(**arrays)

@@ -81,7 +81,7 @@ _ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
 
 class Cells(NamedTuple):
-    """What a network is told of the cells of a road, which never changes."""
+    """Inputs of the network about the cells of a road, which never change."""
 
     unit: FloatArray  # (S + R,) unit of densities [veh/km]
     limit: float  # largest speed limit [km/h], the unit of speeds
@@ -90,7 +90,7 @@ class Cells(NamedTuple):
 
 
 def make_cells(model: ARZModel) -> Cells:
-    """Return what a network is told of a model's road."""
+    """Return the inputs of the network about a model's road."""
     road, S = model.road, model.n_segments
     n_on = road.entries.size - 1
     marks = np.zeros((S, 4))
@@ -108,7 +108,7 @@ def make_cells(model: ARZModel) -> Cells:
     )
 
 
-class Network(NamedTuple):
+class Weights(NamedTuple):
     """Weights of a network of width H with C channels and messages of M numbers, float32."""
 
     inputs: Float32Array  # W, (C + 2 M, 3 H)
@@ -125,12 +125,12 @@ class Network(NamedTuple):
 
 
 def message_width(width: int) -> int:
-    """Return the numbers M of a message in a network of some width."""
+    """Return the size M of a message in a network of some width."""
     return min(width, MESSAGE)
 
 
 def shapes(width: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the weights of a network by name."""
+    """Return the shapes of `Weights` of some width by name."""
     n_inputs = N_CHANNELS + 2 * message_width(width)
     return {
         "inputs": (n_inputs, 3 * width),
@@ -143,7 +143,7 @@ def shapes(width: int) -> dict[str, tuple[int, ...]]:
 
 
 class Memory(NamedTuple):
-    """What a network is given beside the releases, of n episodes."""
+    """Inputs of the network beside the releases, of n episodes, and its estimates."""
 
     inputs: FloatArray  # (n, n_u) the model's inputs of the last prediction
     present: FloatArray  # (n, S, 4) predictions, then estimates, and their deviations
@@ -152,7 +152,7 @@ class Memory(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of a network in n episodes."""
+    """State of the network in n episodes."""
 
     hidden: Float32Array  # (n, S, H)
     ahead: FloatArray  # (n, S, 4) `Memory.present` of the next second before its release
@@ -189,8 +189,8 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
 @kernel
 def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
     """Advance the network by what was released of episodes `(k,)`."""
-    road, _, _, memory, network, state = bundle.parts
-    x = np.empty((episodes.size, road.n_segments, network.inputs.shape[0]), np.float32)
+    road, _, _, memory, weights, state = bundle.parts
+    x = np.empty((episodes.size, road.n_segments, weights.inputs.shape[0]), np.float32)
     read(bundle, episodes, measured, x)
     advance(bundle, episodes, x)
     for k in range(episodes.size):
@@ -334,16 +334,16 @@ def advance(bundle: Bundle, episodes: IntArray, x: Float32Array) -> None:
     """Advance the hidden states, and write what the heads read from them.
 
     Args:
-        bundle: Road, channels, `Cells`, `Memory`, `Network` and `State`.
+        bundle: Road, channels, `Cells`, `Memory`, `Weights` and `State`.
         episodes: Shape (k,).
         x: Shape (k, S, C + 2 M): the channels, and space for sums of messages.
     """
-    road, _, cells, memory, network, state = bundle.parts
+    road, _, cells, memory, weights, state = bundle.parts
     present, hidden, ahead = memory.present, state.hidden, state.ahead
-    S, H = road.n_segments, network.hidden.shape[0]
-    M = (network.inputs.shape[0] - N_CHANNELS) // 2
+    S, H = road.n_segments, weights.hidden.shape[0]
+    M = (weights.inputs.shape[0] - N_CHANNELS) // 2
     g, q = np.empty((S, 3 * H), dtype=np.float32), np.empty((S, 3 * H), dtype=np.float32)
-    raw = np.empty((S, network.heads.shape[1]), dtype=np.float32)
+    raw = np.empty((S, weights.heads.shape[1]), dtype=np.float32)
     # One product for each episode: its bits then do not depend on the batch that it is in.
     for i in range(episodes.size):
         h = hidden[episodes[i]]
@@ -353,16 +353,16 @@ def advance(bundle: Bundle, episodes: IntArray, x: Float32Array) -> None:
             for j in range(M):
                 x[i, end, N_CHANNELS + j] += h[start, j]
                 x[i, start, N_CHANNELS + M + j] += h[end, j]
-        np.dot(x[i], network.inputs, g)
-        np.dot(h, network.hidden, q)
+        np.dot(x[i], weights.inputs, g)
+        np.dot(h, weights.hidden, q)
         for s in range(S):
-            _gate(g[s], q[s], network.inputs_bias, network.hidden_bias, h[s])
-        np.dot(h, network.heads, raw)
+            _gate(g[s], q[s], weights.inputs_bias, weights.hidden_bias, h[s])
+        np.dot(h, weights.heads, raw)
         for s in range(S):
             row = raw[s]
             unit, limit = cells.unit[s], cells.limit
-            _read_heads(row[0:4], network.heads_bias[0:4], unit, limit, present[episodes[i], s])
-            _read_heads(row[4:8], network.heads_bias[4:8], unit, limit, ahead[episodes[i], s])
+            _read_heads(row[0:4], weights.heads_bias[0:4], unit, limit, present[episodes[i], s])
+            _read_heads(row[4:8], weights.heads_bias[4:8], unit, limit, ahead[episodes[i], s])
 
 
 @kernel_part(fastmath={"contract"})

@@ -104,12 +104,12 @@ class RecurrentSettings(_Checked, path=f"{PATH}.recurrent"):
     """Settings of the recurrent network.
 
     Attributes:
-        weights: Name of a network that ships with the package, or a file. A pair of networks, one
-            for releases of flows and one for releases of speeds, goes by the name that they share:
-            ``roads`` stands for ``roads-flows`` or ``roads-speeds``. None takes ``highway`` or
+        weights: Name of weights that ship with the package, or a file. A pair, one for releases of
+            flows and one for releases of speeds, goes by the name that they share: ``roads``
+            stands for ``roads-flows`` or ``roads-speeds``. None takes ``highway`` or
             ``long-highway`` on roads like those of the package, which they were trained on, and
-            ``roads`` on any other. Outside of the ranges on its card a network is used with a
-            warning, and ``info["inherited"]`` names it.
+            ``roads`` on any other. Outside of the ranges on their card they are used with a
+            warning, and ``info["inherited"]`` names this setting.
     """
 
     weights: str | None = None
@@ -172,7 +172,7 @@ class MixtureSettings(_Checked, path=f"{PATH}.mixture"):
     """Settings of the mixture.
 
     Attributes:
-        experts: Two or more names of estimators or of recurrent networks (`RecurrentSettings`).
+        experts: Two or more names of estimators or of weights (`RecurrentSettings`).
             They share all other settings.
         memory: Seconds in which likelihoods are forgotten.
     """
@@ -186,7 +186,7 @@ class MixtureSettings(_Checked, path=f"{PATH}.mixture"):
         if len(self.experts) < 2 or "mixture" in self.experts:
             raise ValueError(
                 f"{PATH}.mixture.experts must be two or more names of other estimators or of "
-                f"networks, got {shown(self.experts)}"
+                f"weights, got {shown(self.experts)}"
             )
 
 

@@ -17,7 +17,7 @@ from agents.filters.plan import OWN, FilterPlan, Round, played_by  # noqa: E402
 from agents.filters.scenarios import MECHANISMS, ROADS, SCHEDULES, ScenarioRanges  # noqa: E402
 from agents.filters.training import WEIGHTS, FilterTraining  # noqa: E402
 from agents.training.run_files import PROGRESS, read_progress  # noqa: E402
-from dptse_env.estimators.recurrent import read_network, write_network  # noqa: E402
+from dptse_env.estimators.recurrent import read_weights, write_weights  # noqa: E402
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE  # noqa: E402
 from dptse_env.evaluation import evaluate  # noqa: E402
 from dptse_env.traffic import RecordLibrary, read_corridor  # noqa: E402
@@ -212,8 +212,8 @@ def test_the_network_with_gradients_is_the_estimator(mechanism, tmp_path):
     network = RecurrentNetwork(5)
     with torch.no_grad():
         network.heads.normal_(0.0, 0.5)
-    write_network(tmp_path / "network.safetensors", network.weights(), card())
-    own, scenario = played_by(tmp_path / "network.safetensors"), mixed(mechanism)
+    write_weights(tmp_path / "weights.safetensors", network.weights(), card())
+    own, scenario = played_by(tmp_path / "weights.safetensors"), mixed(mechanism)
     collected = collect(scenario, own, None)
     keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.traffic_seeds)}
     env, seen = make_vector(SHORT, 2, {**keywords, "action": "scores"}), Seen()
@@ -324,7 +324,7 @@ def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_pat
     """Wherever its scenarios are played."""
     assert whole.done == 4
     assert [row["round"] for row in whole.rows] == [1, 2, 2, 2]
-    played = read_network(str(whole.folder / "played.safetensors"))
+    played = read_weights(str(whole.folder / "played.safetensors"))
     assert played.card["training"]["passes"] == 1  # as it stood when the second round began
 
     def kill(row):
@@ -344,11 +344,11 @@ def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_pat
     assert len(read_progress(tmp_path)) == 4
 
 
-def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_path):
-    path = tmp_path / "a" / "network.safetensors"
+def test_a_training_may_begin_with_other_weights_and_says_so_on_the_card(tmp_path):
+    path = tmp_path / "a" / "weights.safetensors"
     first = FilterTraining(dataclasses.replace(PLAN, rounds=(Round("ekf", 1, 1),)), path.parent)
     first.run()
-    ranges = read_network(str(path)).card["ranges"]
+    ranges = read_weights(str(path)).card["ranges"]
     assert ranges["span"] == [1.0, 2.0]
     assert ranges["flows"] == [1.0, 1.0]
     assert ranges["n_mainline"] == [6, 6]
@@ -356,18 +356,18 @@ def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_p
         PLAN, initial=str(path), teacher=0.5, rounds=(Round(OWN, 1, 1),), seed=5
     )
     second = FilterTraining(plan, tmp_path / "b")
-    for taken, given in zip(second.network.weights(), read_network(str(path)).network, strict=True):
+    for taken, given in zip(second.network.weights(), read_weights(str(path)).weights, strict=True):
         np.testing.assert_array_equal(taken, given)
     second.run()
-    taken_at_first = read_network(str(path)).network
-    last, kept = second.network.weights(), read_network(str(second.folder / WEIGHTS)).network
+    taken_at_first = read_weights(str(path)).weights
+    last, kept = second.network.weights(), read_weights(str(second.folder / WEIGHTS)).weights
     assert not np.array_equal(kept.hidden, last.hidden)  # a moving average, which lags behind
     near, far = (np.abs(kept.hidden - each.hidden).max() for each in (taken_at_first, last))
     assert near < far
-    about = read_network(str(tmp_path / "b" / "network.safetensors")).card["training"]
+    about = read_weights(str(tmp_path / "b" / "weights.safetensors")).card["training"]
     assert (about["plan"]["seed"], about["passes"]) == (5, 1)
-    assert about["plan"]["initial_sha256"] == read_network(str(path)).card["sha256"]
-    with pytest.raises(ValueError, match="width must be that of the initial network, 4, got 8"):
+    assert about["plan"]["initial_sha256"] == read_weights(str(path)).card["sha256"]
+    with pytest.raises(ValueError, match="width must be that of the initial weights, 4, got 8"):
         dataclasses.replace(plan, width=8)
 
 
@@ -379,7 +379,7 @@ def test_a_training_may_begin_with_another_network_and_says_so_on_the_card(tmp_p
         ({"rounds": (Round(OWN, 1, 1),)}, "rounds must begin with one of another estimator"),
         ({"rounds": ()}, "rounds must begin"),
         ({"windows": 4}, r"windows must be an integer in 1\.\.3, got 4"),
-        ({"teacher": 0.5}, "teacher must be 0 without an initial network, got 0.5"),
+        ({"teacher": 0.5}, "teacher must be 0 without initial weights, got 0.5"),
         ({"kind": "densities"}, "kind must be one of flows, speeds, got 'densities'"),
         ({"validation_highways": (5, 9)}, r"validation_highways must be .* outside of \(0, 80\)"),
         ({"initial": "nowhere"}, r"weights must be a file or one of highway, .*, got 'nowhere'"),

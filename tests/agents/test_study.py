@@ -11,7 +11,7 @@ from agents.play import Cell, play
 from agents.study import Place, Study, read_rows, run, write_report, write_table
 from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, values
 from dptse_env import versions
-from dptse_env.estimators.recurrent import read_network
+from dptse_env.estimators.recurrent import read_weights
 from tests.agents.faults import SHORT, rows_of, study
 from tests.helpers import run_killed, save_untrained
 
@@ -152,7 +152,7 @@ def test_an_id_says_all_that_rows_depend_on(tmp_path):
     assert not any(str(tmp_path) in each for each in ids if "corridor" in each)
     # A network of the package by its own name goes with its digest.
     keywords = {"estimator_settings": {"recurrent": {"weights": "highway-flows"}}}
-    assert read_network("highway-flows").card["sha256"] in replace(first, keywords=keywords).id
+    assert read_weights("highway-flows").card["sha256"] in replace(first, keywords=keywords).id
 
 
 def test_pairs_are_of_equal_numbers(monkeypatch):

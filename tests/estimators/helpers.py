@@ -1,4 +1,4 @@
-"""Episodes for the tests of estimators, simulated and recorded, what runs them, and networks."""
+"""Episodes for the tests of estimators, simulated and recorded, what runs them, and weights."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.estimators.base import Estimator
-from dptse_env.estimators.recurrent import FORMAT, write_network
-from dptse_env.estimators.recurrent_kernels import CHANNELS, Network, shapes
+from dptse_env.estimators.recurrent import FORMAT, write_weights
+from dptse_env.estimators.recurrent_kernels import CHANNELS, Weights, shapes
 from dptse_env.model import ARZModel, Channels, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY, Corridor, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -242,7 +242,7 @@ def assert_same(one: Snapshot, other: Snapshot, episodes=slice(None), of=slice(N
         np.testing.assert_array_equal(a, b, err_msg=field)
 
 
-# Networks -----------------------------------------------------------------------------------------
+# Weights ------------------------------------------------------------------------------------------
 
 RANGES = {
     "n_mainline": [2, 30],
@@ -254,11 +254,11 @@ RANGES = {
 }
 
 
-def random_network(width=8):
+def random_weights(width=8):
     """Weights of the size that training gives, so that gates work and outputs move."""
     rng, size = np.random.default_rng(0), 0.4 * (8 / width) ** 0.5
     arrays = {name: rng.normal(0.0, size, shape) for name, shape in shapes(width).items()}
-    return Network(**{name: array.astype(np.float32) for name, array in arrays.items()})
+    return Weights(**{name: array.astype(np.float32) for name, array in arrays.items()})
 
 
 def card(**ranges):
@@ -271,8 +271,8 @@ def card(**ranges):
     }
 
 
-def network_settings(folder, network=None, **ranges):
-    """Settings of a network that is written into a folder."""
-    path = folder / "network.safetensors"
-    write_network(path, network or random_network(), card(**ranges))
+def weights_settings(folder, weights=None, **ranges):
+    """Settings of weights that are written into a folder."""
+    path = folder / "weights.safetensors"
+    write_weights(path, weights or random_weights(), card(**ranges))
     return EstimatorSettings(recurrent=RecurrentSettings(weights=str(path)))

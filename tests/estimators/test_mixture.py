@@ -81,7 +81,7 @@ def test_experts_are_two_or_more_others(experts, message):
         mixing(*experts)
 
 
-def test_an_expert_is_an_estimator_or_a_network():
+def test_an_expert_is_an_estimator_or_the_name_of_weights():
     model = model_of("paper", "speed")
     mixture = make_estimator("mixture", "compiled", model, 1, EstimatorSettings())
     assert [each.saved.source for each in mixture.experts] == ["highway-speeds", "roads-speeds"]

@@ -53,8 +53,8 @@ FAST = [
 ]
 CASES = [(*each, "speed") for each in EVERY]
 CASES += [(name, "compiled", kind) for name in ESTIMATORS for kind in ("flow", "rows")]
-NETWORKS = ("recurrent", "mixture")
-"""Estimators whose estimates are those of networks."""
+LEARNED = ("recurrent", "mixture")
+"""Estimators whose estimates are those of trained weights."""
 MODEL = model_of("paper", "speed")
 
 
@@ -236,7 +236,7 @@ def test_poor_starts_and_ten_times_the_noise_stay_finite_and_within_bounds(
         for field in Snapshot._fields:
             assert np.isfinite(getattr(shown, field)).all(), field
         assert (np.minimum(shown.density, shown.speed) >= 0.0).all()
-        if name in NETWORKS:  # have a range of their own
+        if name in LEARNED:  # have a range of their own
             return
         assert (shown.density <= model.jam_density * (1.0 + 1e-12)).all()
         assert (shown.speed <= model.largest_speed * (1.0 + 1e-12)).all()
@@ -287,7 +287,7 @@ def test_what_is_no_number_diverges_that_episode_only(name, backend, release):
 # Measurements -------------------------------------------------------------------------------------
 
 
-@over(NETWORKS)
+@over(LEARNED)
 def test_an_empty_set_of_measurements_leaves_the_prediction(name, backend, release):
     episodes = simulate(n_steps=14, release=release)
     estimator = started(name, backend, episodes)
@@ -410,7 +410,7 @@ def test_a_cap_holds_the_reported_speeds_and_nothing_else(name, backend):
             step(one, episodes, k)
         expected, found = show(plain), show(held)
         assert (expected.speed > largest).any()
-        assert (found.speed < largest).any() or name in NETWORKS
+        assert (found.speed < largest).any() or name in LEARNED
         speed = np.minimum(expected.speed, largest)
         if name == "blend":  # a mean of speeds that are held already
             assert (found.speed <= speed).all()

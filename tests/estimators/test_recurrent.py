@@ -8,11 +8,11 @@ import pytest
 from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent import (
     member_for,
-    network_for,
     outside,
-    read_network,
-    shipped_networks,
-    write_network,
+    read_weights,
+    shipped_weights,
+    weights_for,
+    write_weights,
 )
 from dptse_env.estimators.recurrent_kernels import (
     LARGEST_CORRECTION,
@@ -24,16 +24,16 @@ from dptse_env.estimators.recurrent_kernels import (
 from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY
 from tests.hostile import check_hostile, edited
 
-from .helpers import card, network_settings, random_network, run, simulate, started, step
+from .helpers import card, random_weights, run, simulate, started, step, weights_settings
 
 torch = pytest.importorskip("torch")
 
 from agents.filters import network as trained  # noqa: E402
 
 
-def of_network(episodes, folder, network=None, **ranges):
-    """The estimator of a network that is written into a folder."""
-    settings = network_settings(folder, network, **ranges)
+def of_weights(episodes, folder, weights=None, **ranges):
+    """The estimator of weights that are written into a folder."""
+    settings = weights_settings(folder, weights, **ranges)
     return started("recurrent", "compiled", episodes, settings)
 
 
@@ -101,8 +101,8 @@ class Twin:
     def __init__(self, estimator):
         self.model, n = estimator.model, estimator.n_episodes
         cells = make_cells(self.model)
-        self.network = trained.RecurrentNetwork(estimator.saved.network.width)
-        self.network.take(estimator.saved.network)
+        self.network = trained.RecurrentNetwork(estimator.saved.weights.width)
+        self.network.take(estimator.saved.weights)
         S = self.model.n_segments
         edges = self.model.road.edges + S * np.arange(n)[:, None, None]
         self.roads = trained.Roads(
@@ -154,7 +154,7 @@ def test_it_is_the_network_that_is_trained(release, width, noise, tmp_path):
     What is far off is held to a range.
     """
     episodes = simulate(n=3, n_steps=40, noise=noise, release=release)
-    estimator = of_network(episodes, tmp_path, random_network(width))
+    estimator = of_weights(episodes, tmp_path, random_weights(width))
     twin, far = Twin(estimator), []
     for k in range(40):
         step(estimator, episodes, k)
@@ -181,7 +181,7 @@ def test_it_is_the_network_that_is_trained(release, width, noise, tmp_path):
 def test_news_travel_from_cell_to_cell(tmp_path):
     """One cell a second, in both directions and along ramps."""
     episodes = simulate(n_steps=1)
-    pair = [of_network(episodes, tmp_path) for _ in range(2)]
+    pair = [of_weights(episodes, tmp_path) for _ in range(2)]
     n = episodes.model.n_segments
     sparsity = np.eye(n, dtype=bool)
     for start, end in episodes.model.road.edges:
@@ -199,9 +199,9 @@ def test_news_travel_from_cell_to_cell(tmp_path):
 
 def test_deviations_and_estimates_stay_in_their_range(tmp_path):
     episodes = simulate(n_steps=30)
-    network = random_network()
-    network = network._replace(heads_bias=np.array([90, 90, -90, 90] * 2, dtype=np.float32))
-    estimator = of_network(episodes, tmp_path, network)
+    weights = random_weights()
+    weights = weights._replace(heads_bias=np.array([90, 90, -90, 90] * 2, dtype=np.float32))
+    estimator = of_weights(episodes, tmp_path, weights)
     run(estimator, episodes, range(30))
     model = episodes.model
     estimate, unit = estimator.estimate(), make_cells(model).unit[: model.n_segments]
@@ -210,19 +210,19 @@ def test_deviations_and_estimates_stay_in_their_range(tmp_path):
     np.testing.assert_allclose(estimate.density_std[0], unit * np.exp(LOWEST_SPREAD))
 
 
-def test_what_a_network_was_not_trained_on_is_named(tmp_path):
-    path, road = tmp_path / "network.safetensors", PAPER_HIGHWAY
+def test_what_weights_were_not_trained_on_is_named(tmp_path):
+    path, road = tmp_path / "weights.safetensors", PAPER_HIGHWAY
     for ranges, names in (
         ({"n_mainline": [3, 15], "lanes": [1, 3], "span": [1, 3], "flows": [0, 0]}, []),
         ({"n_mainline": [3, 9]}, ["n_mainline"]),
         ({"span": [1, 2], "flows": [1, 1]}, ["span", "flows"]),
         ({"lanes": [2, 3], "speed_limit": [80.0, 100.0]}, ["speed_limit", "lanes"]),
     ):
-        write_network(path, random_network(), {**card(), "ranges": ranges})
-        assert set(outside(read_network(str(path)), road.road, False, 3)) == set(names)
+        write_weights(path, random_weights(), {**card(), "ranges": ranges})
+        assert set(outside(read_weights(str(path)), road.road, False, 3)) == set(names)
 
 
-# Files of networks --------------------------------------------------------------------------------
+# Files of weights ---------------------------------------------------------------------------------
 
 DIGESTS = {
     "highway-flows": ("a7cd6a7d0da0", "463df28b4d90"),
@@ -236,25 +236,25 @@ DIGESTS = {
 
 @pytest.fixture
 def path(tmp_path):
-    path = tmp_path / "network.safetensors"
-    write_network(path, random_network(), card())
+    path = tmp_path / "weights.safetensors"
+    write_weights(path, random_weights(), card())
     return path
 
 
 def test_what_is_written_is_read(path, tmp_path):
-    saved = read_network(str(path))
-    for name, array in random_network()._asdict().items():
-        np.testing.assert_array_equal(getattr(saved.network, name), array)
+    saved = read_weights(str(path))
+    for name, array in random_weights()._asdict().items():
+        np.testing.assert_array_equal(getattr(saved.weights, name), array)
     assert {key: value for key, value in saved.card.items() if key != "sha256"} == card()
-    write_network(tmp_path / "again.safetensors", random_network(), card())
+    write_weights(tmp_path / "again.safetensors", random_weights(), card())
     assert (tmp_path / "again.safetensors").read_bytes() == path.read_bytes()
 
 
 def test_the_weights_that_ship_are_those_that_were_recorded():
     digests = {}
-    for name in shipped_networks():
-        saved, content = read_network(name), hashlib.sha256()
-        for array in saved.network:
+    for name in shipped_weights():
+        saved, content = read_weights(name), hashlib.sha256()
+        for array in saved.weights:
             content.update(array.tobytes())
         digests[name] = saved.card.get("converted_from", "")[:12], content.hexdigest()[:12]
     assert digests == DIGESTS
@@ -263,18 +263,18 @@ def test_the_weights_that_ship_are_those_that_were_recorded():
 def test_a_pair_is_found_by_the_name_it_shares(tmp_path):
     source = str(tmp_path / "pair")
     single = f"{source}-flows.safetensors"
-    write_network(single, random_network(), card())
+    write_weights(single, random_weights(), card())
     assert member_for(source, flows=True) == single
     assert member_for(source, flows=False) == source  # refused by the one who reads it
     assert member_for(single, flows=True) == single
     assert member_for("highway", flows=True) == "highway-flows"
     assert member_for("highway", flows=False) == "highway-speeds"
     with pytest.raises(ValueError, match=r"must be a file or one of highway, highway-flows, .*, g"):
-        read_network("nowhere")
+        read_weights("nowhere")
 
 
 @pytest.mark.parametrize(
-    ("road", "flows", "network"),
+    ("road", "flows", "weights"),
     [
         (PAPER_HIGHWAY, True, "highway-flows"),
         (PAPER_HIGHWAY, False, "highway-speeds"),
@@ -284,12 +284,12 @@ def test_a_pair_is_found_by_the_name_it_shares(tmp_path):
         (PAPER_HIGHWAY.replaced(speed_limit=30.0), True, "roads-flows"),
     ],
 )
-def test_the_network_of_the_package_that_knows_a_road_is_taken(road, flows, network):
-    assert network_for(None, road.road, flows).source == network
+def test_the_weights_of_the_package_that_know_a_road_are_taken(road, flows, weights):
+    assert weights_for(None, road.road, flows).source == weights
 
 
 def test_damaged_files_are_refused(path, tmp_path):
-    check_hostile(lambda path: read_network(str(path)), path, tmp_path / "bad.safetensors")
+    check_hostile(lambda path: read_weights(str(path)), path, tmp_path / "bad.safetensors")
 
 
 @pytest.mark.parametrize(
@@ -305,17 +305,17 @@ def test_damaged_files_are_refused(path, tmp_path):
 )
 def test_other_content_is_refused(change, message, path):
     path.write_bytes(edited(path, change))
-    with pytest.raises(ValueError, match=rf"\.safetensors is not a saved network: .*{message}"):
-        read_network(str(path))
+    with pytest.raises(ValueError, match=rf"\.safetensors is not a file of weights: .*{message}"):
+        read_weights(str(path))
 
 
 def test_nothing_is_written_that_could_not_be_read(tmp_path):
-    network, path = random_network(), tmp_path / "x.safetensors"
+    weights, path = random_weights(), tmp_path / "x.safetensors"
     for bad, about in (
-        (network._replace(heads=network.heads * np.float32(np.inf)), card()),
-        (network._replace(heads=network.heads[:1]), card()),
-        (network, {**card(), "format": "mine"}),
+        (weights._replace(heads=weights.heads * np.float32(np.inf)), card()),
+        (weights._replace(heads=weights.heads[:1]), card()),
+        (weights, {**card(), "format": "mine"}),
     ):
         with pytest.raises(ValueError, match=r"heads|format"):
-            write_network(path, bad, about)
+            write_weights(path, bad, about)
     assert not path.exists()

@@ -250,8 +250,8 @@ FILES = {
         ["evaluate", "--policies", "{path}"],
     ),
     "model": ("m.zip", SETTINGS, ["evaluate", "--policies", "stable_baselines3:PPO={path}"]),
-    "network": (
-        "n.safetensors", content("dptse_env/estimators/networks/*.safetensors"),
+    "weights": (
+        "n.safetensors", content("dptse_env/estimators/weights/*.safetensors"),
         ["train-estimator", "--initial", "{path}"],
     ),
     "trajectories": (
@@ -278,7 +278,7 @@ FILES = {
 """Files that commands read: a name, a content, and the command."""
 
 FAST = [
-    ("road", "missing"), ("policy", "truncated"), ("network", "noise"), ("net", "folder"),
+    ("road", "missing"), ("policy", "truncated"), ("weights", "noise"), ("net", "folder"),
     ("trajectories", "truncated"), ("replayed field", "folder"),
 ]  # fmt: skip
 ALL = [(kind, how) for kind in FILES for how in ("missing", "folder", "noise", "truncated")]

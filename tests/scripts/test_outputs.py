@@ -27,7 +27,7 @@ ONE = ["--workers", "1"]
 COMMANDS = {
     "evaluate": (["--env", SHORT, *ONE], "tables.md"),
     "train": (["--env", SHORT, "--steps", "100", *ONE], "best.safetensors"),
-    "train-estimator": (SMALL, "network-flows.safetensors"),
+    "train-estimator": (SMALL, "weights-flows.safetensors"),
     "tune": (["--env", SHORT, "--estimators", "random_walk"], "random_walk-paper-paper.json"),
     "suite": (["speed-front", "--cells", "short", *ONE], "card.json"),
     "study": (["examples.my_study:STUDY", *ONE], "tables.md"),

@@ -12,7 +12,7 @@ import tyro
 
 from agents.filters.plan import OWN, Round
 from agents.training.run_files import read_progress
-from dptse_env.estimators.recurrent import read_network
+from dptse_env.estimators.recurrent import read_weights
 from scripts import train_estimator
 from scripts.train_estimator import Args, make_plan, parse_round
 from tests.helpers import SHORT
@@ -45,7 +45,7 @@ def test_it_trains_a_pair_that_an_environment_takes(tmp_path, capsys):
         assert [row["round"] for row in rows] == [1, 1, 2]
         best.setdefault(kind, []).append((rows[-1]["validation"], seed))
     for kind, privacy in (("flows", "capped"), ("speeds", "paper")):
-        taken = read_network(str(tmp_path / f"network-{kind}.safetensors")).card["name"]
+        taken = read_weights(str(tmp_path / f"weights-{kind}.safetensors")).card["name"]
         assert taken == f"{kind}-{min(best[kind])[1]}"
         gym.make(SHORT, privacy=privacy, **keywords).reset(seed=0)
     with pytest.raises(ValueError, match="width is 4 there and 8 now"):

@@ -188,7 +188,7 @@ def test_randomised_traffic_keeps_the_road_and_the_base_demand(corridor):
     assert last_start + random.conditions.incident.duration[0] < corridor.conditions.duration
 
 
-@pytest.mark.parametrize("name", ["ekf.json", "networks/mine-flows.safetensors"])
+@pytest.mark.parametrize("name", ["ekf.json", "weights/mine-flows.safetensors"])
 def test_names_of_files_are_those_of_the_folder_of_the_road_file(road, name):
     text = f'estimator_settings = {{ recurrent = {{ weights = "{name}" }} }}\n'
     road.write_text(ROAD + text)

@@ -20,7 +20,7 @@ PACKAGES = {
 }
 """Folders and files of the repository that are in a wheel, and where."""
 IN_A_WHEEL = {"", ".json", ".parquet", ".py", ".safetensors", ".txt", ".typed", ".xml"}
-"""Kinds of files of the packages: code, settings, networks, rows, policies, equal digests."""
+"""Kinds of files of the packages: code, settings, weights, SUMO nets, rows, policies, digests."""
 
 FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}
 """Folders of a source archive."""

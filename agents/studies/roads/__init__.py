@@ -1,10 +1,10 @@
 """Estimators on roads that nobody trained on: own roads, sections of longer ones, other simulators.
 
 Every vehicle answers queries, which go round robin. The filters have the parameters and settings
-that were calibrated for PrivateHighway-v1. Networks other than those of the package are given by
+that were calibrated for PrivateHighway-v1. Weights other than those of the package are given by
 ``--weights``; rows of the others are played once.
 
-dptse study roads --weights results/networks/seed-2/roads --output results/mine
+dptse study roads --weights results/weights/seed-2/roads --output results/mine
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from agents.tables import (
     mean,
     tenths,
 )
-from dptse_env.estimators.recurrent import member_for, shipped_networks
+from dptse_env.estimators.recurrent import member_for, shipped_weights
 from dptse_env.utils.files import file_digest
 
 PRIVATE, PAPER = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/PaperHighway-v0"
 LONG = "dptse_env:dptse/LongHighway-v0"
 SEEDS, MORE_SEEDS = tuple(range(2000, 2008)), tuple(range(2000, 2016))
-FILTERS, NETWORK, MIXTURE = ("ekf", "blend", "asm"), "recurrent", "mixture"
+FILTERS, RECURRENT, MIXTURE = ("ekf", "blend", "asm"), "recurrent", "mixture"
 PACED, CORRECTED = "paced", "corrected"
 RELEASES: dict[str, dict[str, Any]] = {
     PACED: {"privacy": PACED, "epsilon": 5.0},
@@ -56,7 +56,7 @@ RELEASES: dict[str, dict[str, Any]] = {
 
 
 class Learned(NamedTuple):
-    """An estimator with networks in it; those of the package if none is named."""
+    """An estimator with weights; those of the package if none are named."""
 
     estimator: str
     network: str = ""
@@ -66,7 +66,7 @@ class Learned(NamedTuple):
         return f"`{self.estimator}` {self.network}".rstrip()
 
 
-SHIPPED = (Learned(NETWORK), Learned(MIXTURE))
+SHIPPED = (Learned(RECURRENT), Learned(MIXTURE))
 """Those that come with the package."""
 
 _Part = tuple[dict[str, Any], tuple[int, ...]]
@@ -105,7 +105,7 @@ OTHERS: dict[str, Road] = {
     "PaperHighway-v0": Road(PAPER, [(_CALIBRATED, MORE_SEEDS)], ("paper", CORRECTED)),
     "LongHighway-v0": Road(LONG, [({}, SEEDS)], (PACED,)),
 }
-"""Beside the own roads: recorded ones, and those that networks are trained on."""
+"""Beside the own roads: recorded ones, and those that weights are trained on."""
 OWN = {name: Road(PRIVATE, [(keywords, SEEDS)]) for name, keywords in OWN_ROADS.items()}
 ROADS = {**OWN, **OTHERS}
 
@@ -121,25 +121,25 @@ def on_road(road: str, release: str, estimator: str, network: str = "") -> Label
 
 
 def member(weights: str, release: str) -> str | None:
-    """Return the network of a pair that suits a release model; None where it is missing."""
+    """Return the member of a pair that suits a release model; None where it is missing."""
     found = member_for(weights, flows=release == PACED)
-    return found if found in shipped_networks() or Path(found).is_file() else None
+    return found if found in shipped_weights() or Path(found).is_file() else None
 
 
 def named(weights: str) -> str:
-    """Return the name of a network in tables: its own, and for files that with a digest of them.
+    """Return the name of weights in tables: their own, and for files that with a digest of them.
 
     Raises:
-        FileNotFoundError: There is no such network.
+        FileNotFoundError: There are no such weights.
     """
     members = sorted({found for each in RELEASES if (found := member(weights, each))})
     if not members:
         raise FileNotFoundError(
-            f"weights must be a network of the package, a file, or what the files "
+            f"weights must be a name of the package, a file, or what the files "
             f"<weights>-flows.safetensors and <weights>-speeds.safetensors begin with, "
             f"got {weights!r}"
         )
-    if members[0] in shipped_networks():
+    if members[0] in shipped_weights():
         return weights
     digest = hashlib.sha256("".join(map(file_digest, members)).encode()).hexdigest()
     return f"{Path(weights).name} {digest[:6]}"
@@ -148,7 +148,7 @@ def named(weights: str) -> str:
 def road_cells(
     road: str, release: str, estimator: str, weights: str = "", network: str = ""
 ) -> list[Cell]:
-    """Return the cells of an estimator on a road, a network with its weights and its name."""
+    """Return the cells of an estimator on a road, with weights and their name if there are any."""
     more: dict[str, Any] = {"estimator": estimator}
     if weights:
         more["estimator_settings"] = {"recurrent": {"weights": weights}}
@@ -163,17 +163,17 @@ def road_cells(
 
 
 def study(weights: Sequence[str] = ()) -> Study:
-    """Return the study, with some networks beside those of the package.
+    """Return the study, with some weights beside those of the package.
 
     Args:
-        weights: Networks, each a name or what the files of a pair begin with. One of a pair is
-            played where it suits.
+        weights: Each a name or what the files of a pair begin with. One of a pair is played where
+            it suits.
 
     Raises:
-        FileNotFoundError: There is no such network.
+        FileNotFoundError: There are no such weights.
     """
-    who = [(name, "", "") for name in (*FILTERS, NETWORK, MIXTURE)]
-    who += [(NETWORK, each, named(each)) for each in weights]
+    who = [(name, "", "") for name in (*FILTERS, RECURRENT, MIXTURE)]
+    who += [(RECURRENT, each, named(each)) for each in weights]
     cells = [
         each
         for (road, release), (estimator, own, name) in product(lines(), who)
@@ -211,9 +211,9 @@ def gain(rows: pl.DataFrame, learned: Learned, road: str, release: str) -> Inter
 
 
 def learned_in(rows: pl.DataFrame) -> list[Learned]:
-    """Return the estimators with networks that were played, those of the package first."""
-    own = rows.filter(pl.col("estimator") == NETWORK, pl.col("network") != "")
-    return [*SHIPPED, *(Learned(NETWORK, name) for name in own["network"].unique().sort())]
+    """Return the estimators with weights that were played, those of the package first."""
+    own = rows.filter(pl.col("estimator") == RECURRENT, pl.col("network") != "")
+    return [*SHIPPED, *(Learned(RECURRENT, name) for name in own["network"].unique().sort())]
 
 
 def chi2(rows: pl.DataFrame, labels: Labels) -> list[float]:
@@ -222,7 +222,7 @@ def chi2(rows: pl.DataFrame, labels: Labels) -> list[float]:
 
 
 def table_of(rows: pl.DataFrame, learned: Learned) -> str:
-    """Return the table of an estimator with networks beside the filters."""
+    """Return the table of an estimator with weights beside the filters."""
     own = learned.estimator
 
     def of(estimator: str, line: tuple[str, str]) -> Labels:
@@ -278,7 +278,7 @@ def draw_gains(rows: pl.DataFrame) -> Figure:
     names = list(dict.fromkeys(road for road, _ in lines()))
     series = {
         release: {
-            road: {label: gain(rows, Learned(NETWORK), road, release)}
+            road: {label: gain(rows, Learned(RECURRENT), road, release)}
             for road in names
             if release in ROADS[road].releases
         }
@@ -288,7 +288,7 @@ def draw_gains(rows: pl.DataFrame) -> Figure:
 
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
-    """Return a table for each estimator with networks, and draw the gains of `recurrent`."""
+    """Return a table for each estimator with weights, and draw the gains of `recurrent`."""
     title = "Error of the recurrent network below that of the best filter, 95 % intervals"
     save_measured(folder / "fig_roads.png", title, draw_gains, rows)
     parts = ["# Roads that nobody trained on", NOTES, "![Gains](fig_roads.png)"]

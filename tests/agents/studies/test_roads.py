@@ -14,7 +14,7 @@ from dptse_env.traffic import CORRIDORS, Record
 from dptse_env.traffic.imported import load_record
 
 RECORDED = Path(__file__).parents[3] / "results" / "roads"
-NETWORKS = Path(recurrent.__file__).parent / "networks"
+WEIGHTS = Path(recurrent.__file__).parent / "weights"
 
 
 @pytest.fixture
@@ -44,15 +44,15 @@ def test_all_roads_are_played():
     assert {cell.labels["road"] for cell in roads.study().cells} == set(roads.ROADS)
 
 
-def test_a_network_in_files_has_cells_of_its_own_which_follow_its_weights(tmp_path):
+def test_weights_in_files_have_cells_of_their_own_which_follow_the_content(tmp_path):
     prefix = tmp_path / "mine"
     for kind in ("flows", "speeds"):
-        shutil.copy(NETWORKS / f"highway-{kind}.safetensors", f"{prefix}-{kind}.safetensors")
+        shutil.copy(WEIGHTS / f"highway-{kind}.safetensors", f"{prefix}-{kind}.safetensors")
     name = roads.named(str(prefix))
     first, shipped = roads.study([str(prefix)]).cells, roads.study().cells
     known, first = {cell.id for cell in shipped}, {cell.id for cell in first}
     assert first > known
-    shutil.copy(NETWORKS / "highway-flows.safetensors", f"{prefix}-speeds.safetensors")
+    shutil.copy(WEIGHTS / "highway-flows.safetensors", f"{prefix}-speeds.safetensors")
     assert roads.named(str(prefix)) != name
     changed = {cell.id for cell in roads.study([str(prefix)]).cells}
     assert changed & first == known
