@@ -32,7 +32,7 @@ from dptse_env.release import (
     BandwidthUnit,
     PacedSettings,
     PrivacySettings,
-    QueryOptions,
+    Queries,
 )
 from dptse_env.release.queries import check_spans
 from dptse_env.spaces.actions import ACTION_ENCODINGS
@@ -187,9 +187,9 @@ class EnvConfig:
         return not self.penetration.is_complete or self.detectors != Detectors()
 
     @cached_property
-    def queries(self) -> QueryOptions:
+    def queries(self) -> Queries:
         """The queries among which a policy chooses."""
-        return QueryOptions.make(
+        return Queries.make(
             self.corridor.geometry.n_mainline,
             self.bandwidth,
             self.query_spans,

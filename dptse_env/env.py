@@ -28,11 +28,11 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     estimate small with few queries. Queries never change the traffic: an episode replays a record
     of SUMO, made once for each traffic seed and cached on disk.
 
-    **Queries**: by default an option is one mainline segment, so that there are G = n options, and
-    a step may query as many as the ``bandwidth``. With ``query_spans`` an option is the average
-    over one or several neighbouring segments; ``interface.queries`` is the table of all G. An
-    option costs as much of the ``bandwidth`` as it has segments, or one
-    (``bandwidth_unit="sums"``). Options that overlap may be queried together; each answer has noise
+    **Queries**: by default a query is one mainline segment, so that there are G = n queries, and
+    a step may query as many as the ``bandwidth``. With ``query_spans`` a query is the average
+    over one or several neighbouring segments; ``interface.queries`` is the table of all G. A
+    query costs as much of the ``bandwidth`` as it has segments, or one
+    (``bandwidth_unit="sums"``). Queries that overlap may be queried together; each answer has noise
     of its own.
 
     **Observation**: a flat float32 ``Box`` of named blocks, in this order; ``interface.observations
@@ -70,15 +70,15 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     **Action**: ``action`` chooses the encoding; a sampled action never raises. B is the largest
     number of queries that the bandwidth pays for.
 
-    | ``action``     | space                      | meaning                                        |
-    | :--            | :--                        | :--                                            |
-    | ``mask``       | ``MultiBinary(G)``         | a flag per option; too many are cut in turn    |
-    | ``scores``     | ``Box(-1, 1, (G,))``       | the highest scores, as far as bandwidth goes   |
-    | ``slots``      | ``MultiDiscrete([G] * B)`` | one option for each of the B queries           |
-    | ``sequential`` | ``Discrete(G)``            | one option per action, see `action_masks`      |
+    | ``action``     | space                      | meaning                                      |
+    | :--            | :--                        | :--                                          |
+    | ``mask``       | ``MultiBinary(G)``         | a flag per query; too many are cut in turn   |
+    | ``scores``     | ``Box(-1, 1, (G,))``       | the highest scores, as far as bandwidth goes |
+    | ``slots``      | ``MultiDiscrete([G] * B)`` | a query in each of B slots                   |
+    | ``sequential`` | ``Discrete(G)``            | one query per action, see `action_masks`     |
 
     Under ``sequential`` the traffic stands still, and the reward is 0, until the bandwidth pays for
-    no other option.
+    no other query.
 
     **Reward**: minus the root mean squared error over the mainline, at most 0: of densities and
     speeds together, each in units of its scale (``joint``), or of one of them (``density``,
@@ -93,24 +93,24 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
 
     **Info**: the same keys at the reset and at every step; numbers are floats, but for the seed.
 
-    | key                 | value                                                                  |
-    | :--                 | :--                                                                    |
-    | ``rmse_density``    | error of the estimated mainline densities [veh/km]; true traffic       |
-    | ``rmse_speed``      | error of the speeds of occupied segments [km/h]; true traffic          |
-    | ``n_occupied``      | mainline segments with a vehicle; true traffic                         |
-    | ``traffic_seed``    | seed of the record that is replayed, an integer; true traffic          |
-    | ``n_dropped``       | requested options that were cut, repeated or replaced                  |
-    | ``queried``         | the options that were queried, flags of shape (G,)                     |
-    | ``diverged``        | 1 if the estimator diverged in this second and was started anew        |
-    | ``fallback``        | 1 if its update had no solution in this second: it only predicted      |
-    | ``spent_mu``        | privacy loss of a vehicle so far, at most: Gaussian DP parameter       |
-    | ``spent_epsilon``   | the same as epsilon at the configured delta                            |
-    | ``prices``          | under ``paced``: last price of each option, 0 before, shape (G,)       |
-    | ``spent_share``     | under ``paced``: as in the observation, shape (n,)                     |
-    | ``centre_fallback`` | under ``paced``: 1 if no prediction was finite to centre flows on      |
-    | ``truth``           | true traffic, with ``truth_in_info=True`` only                         |
-    | ``privacy``         | at the reset only: the guarantee and its account, see `privacy`        |
-    | ``inherited``       | at the reset only: keywords whose values belong to another road        |
+    | key                 | value                                                             |
+    | :--                 | :--                                                               |
+    | ``rmse_density``    | error of the estimated mainline densities [veh/km]; true traffic  |
+    | ``rmse_speed``      | error of the speeds of occupied segments [km/h]; true traffic     |
+    | ``n_occupied``      | mainline segments with a vehicle; true traffic                    |
+    | ``traffic_seed``    | seed of the record that is replayed, an integer; true traffic     |
+    | ``n_dropped``       | requested queries that were cut, repeated or replaced             |
+    | ``queried``         | the queries that were made, flags of shape (G,)                   |
+    | ``diverged``        | 1 if the estimator diverged in this second and was started anew   |
+    | ``fallback``        | 1 if its update had no solution in this second: it only predicted |
+    | ``spent_mu``        | privacy loss of a vehicle so far, at most: Gaussian DP parameter  |
+    | ``spent_epsilon``   | the same as epsilon at the configured delta                       |
+    | ``prices``          | under ``paced``: last price of each query, 0 before, shape (G,)   |
+    | ``spent_share``     | under ``paced``: as in the observation, shape (n,)                |
+    | ``centre_fallback`` | under ``paced``: 1 if no prediction was finite to centre flows on |
+    | ``truth``           | true traffic, with ``truth_in_info=True`` only                    |
+    | ``privacy``         | at the reset only: the guarantee and its account, see `privacy`   |
+    | ``inherited``       | at the reset only: keywords whose values belong to another road   |
 
     Values marked "true traffic" serve training and evaluation, as the reward does. They are not
     covered by the guarantee, and no policy may act on them. The others are public. ``spent_mu`` and
@@ -129,8 +129,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `parameters`         | "paper"         | of the traffic model: a name, a mapping, a file     |
     | `estimator_settings` | None            | tuning of the estimator; None for what ships        |
     | `bandwidth`          | 5               | largest cost of the queries of a step               |
-    | `query_spans`        | (1,)            | numbers of neighbouring segments of an option       |
-    | `bandwidth_unit`     | "segments"      | or `sums`: what an option costs                     |
+    | `query_spans`        | (1,)            | numbers of neighbouring segments of a query         |
+    | `bandwidth_unit`     | "segments"      | or `sums`: what a query costs                       |
     | `action`             | "mask"          | encoding of actions, see above                      |
     | `observation`        | ("default",)    | blocks of the observation, see above                |
     | `privacy`            | "paper"         | or `corrected`, `capped`, `paced`, a mapping        |
@@ -254,7 +254,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
         return outcome.observation[0], reward, False, truncated, process.info(0)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return flags (G,) of the options that may be picked next, for ``action="sequential"``.
+        """Return flags (G,) of the queries that may be picked next, for ``action="sequential"``.
 
         Raises:
             ValueError: A step takes one action only.

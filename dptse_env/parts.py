@@ -19,7 +19,7 @@ from dptse_env.release import (
     RELEASE_MODELS,
     VOID_REASONS,
     PrivacyReport,
-    QueryOptions,
+    Queries,
     ReleaseModel,
     Task,
     Traffic,
@@ -38,34 +38,34 @@ class QueryInterface:
     """The interface of an environment to a policy; it holds no state of episodes.
 
     Attributes:
-        queries: The options that can be queried.
+        queries: The queries to choose from.
         actions: The action encoding, with its space.
         observations: The observation encoding, with its space and block names.
         reward: The reward, a function of a `dptse_env.spaces.rewards.ScoredSecond`; its attribute
             ``term`` says which errors greedy schedules weigh.
     """
 
-    queries: QueryOptions
+    queries: Queries
     actions: ActionEncoding
     observations: ObservationEncoding
     reward: Any
 
     def picked(self, observation: Observation) -> BoolArray:
-        """Return the options picked so far for the next query, shape (..., G).
+        """Return the queries picked so far for the next query, shape (..., G).
 
         Args:
             observation: Shape (..., size); without a block ``picked`` there are none.
         """
         if "picked" not in self.observations.slices:
-            return np.zeros((*observation.shape[:-1], self.queries.n_options), dtype=bool)
+            return np.zeros((*observation.shape[:-1], self.queries.n_queries), dtype=bool)
         return self.observations.block(observation, "picked") > 0
 
     def require_sequential(self) -> None:
-        """Raise ``ValueError`` unless an action picks one option, as for ``"sequential"``."""
+        """Raise ``ValueError`` unless an action picks one query, as for ``"sequential"``."""
         if not self.actions.picks_one_by_one:
             raise ValueError(
                 "action_masks() needs action='sequential' or another encoding that picks one "
-                f"option per action, got {name_of_class(self.actions)}"
+                f"query per action, got {name_of_class(self.actions)}"
             )
 
 

@@ -74,7 +74,7 @@ class QueryProcess:
         time: Second of the record that each episode stands at, shape (n,).
         start: Second that it began at, below 0 before its first reset, shape (n,).
         traffic_index: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
-        queried: The options of each episode's last query, shape (n, G).
+        queried: The queries of each episode's last query, shape (n, G).
         age: Steps since each mainline segment was last observed, shape (n, n_mainline).
         released: The last releases of the M rows, shape (n, M, 2).
         pending: State of the action encoding between actions.
@@ -132,11 +132,11 @@ class QueryProcess:
         self._checks_decisions = is_foreign(self.interface.actions)
         self._seeds = np.array(self.config.traffic_seeds)
         queries = self.interface.queries
-        self.pending = PendingPicks(n, queries.n_options)
+        self.pending = PendingPicks(n, queries.n_queries)
         self.traffic_index = np.zeros(n, dtype=np.int64)
         self.time = np.zeros(n, dtype=np.int64)
         self.start = np.full(n, -self.config.horizon_steps, dtype=np.int64)
-        self.queried = np.zeros((n, queries.n_options), dtype=bool)
+        self.queried = np.zeros((n, queries.n_queries), dtype=bool)
         self.n_dropped = np.zeros(n, dtype=np.int64)
         self.age = np.zeros((n, queries.n_mainline), dtype=np.int64)
         self.released = np.zeros((n, self.model.channels.size, 2))

@@ -228,10 +228,10 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         return Transition(self._observation.copy(), reward, truncated, to_reset, final)
 
     def action_masks(self) -> BoolArray:
-        """Return flags of the options that may be picked next, shape (n, G), for ``sequential``.
+        """Return flags of the queries that may be picked next, shape (n, G), for ``sequential``.
 
         Raises:
-            ValueError: An action is not the pick of one option.
+            ValueError: An action is not the pick of one query.
             gymnasium.error.ResetNeeded: An episode was never reset.
         """
         self.interface.require_sequential()

@@ -28,12 +28,12 @@ HELD_OUT = range(1000, 1008)
 class Agent(nn.Module):
     """An actor and a critic, which scale observations as those of the first rollout were."""
 
-    def __init__(self, size: int, n_slots: int, n_options: int) -> None:
+    def __init__(self, size: int, n_slots: int, n_queries: int) -> None:
         """Make both networks; all options start equally likely."""
         super().__init__()
-        self.shape, self.mean, self.std = (n_slots, n_options), torch.zeros(size), torch.ones(size)
+        self.shape, self.mean, self.std = (n_slots, n_queries), torch.zeros(size), torch.ones(size)
         self.trunk = nn.Sequential(nn.Linear(size, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh())
-        self.actor, self.critic = nn.Linear(64, n_slots * n_options), nn.Linear(64, 1)
+        self.actor, self.critic = nn.Linear(64, n_slots * n_queries), nn.Linear(64, 1)
         nn.init.zeros_(self.actor.weight)
 
     def forward(self, observation: torch.Tensor) -> tuple[Independent, torch.Tensor]:

@@ -364,7 +364,7 @@ class PricedRelease(SumRelease):
 
     def __init__(self, task, traffic):
         super().__init__(task, traffic)
-        self.prices = np.zeros((task.n_episodes, task.queries.n_options))
+        self.prices = np.zeros((task.n_episodes, task.queries.n_queries))
         self.spent_share = np.zeros((task.n_episodes, task.corridor.geometry.n_mainline))
 
     def reset(self, episodes, generators):
@@ -373,7 +373,7 @@ class PricedRelease(SumRelease):
 
     def release(self, request):
         queries = self.task.queries
-        asked = request.observed[:, : queries.n_options]
+        asked = request.observed[:, : queries.n_queries]
         before = self.prices[request.episodes]
         self.prices[request.episodes] = np.where(asked, 0.01, before)
         self.spent_share[request.episodes] += 0.25 * self.task.covered(request.observed)

@@ -222,10 +222,11 @@ def releases(case: str) -> Numbers:
     process.measure = watched
     _, info = env.reset(seed=7)
     report = json.dumps(info["privacy"], sort_keys=True)
-    n_options, n_queries = process.interface.queries.n_options, process.interface.queries.bandwidth
+    queries = process.interface.queries
+    n_chosen = min(2, queries.bandwidth)
     for _ in range(SECONDS):
-        action = np.zeros(n_options, dtype=np.int8)
-        action[rng.choice(n_options, min(2, n_queries), replace=False)] = 1
+        action = np.zeros(queries.n_queries, dtype=np.int8)
+        action[rng.choice(queries.n_queries, n_chosen, replace=False)] = 1
         *_, info = env.step(action)
         spent.append(info["spent_mu"])
     return {

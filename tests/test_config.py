@@ -20,7 +20,7 @@ from dptse_env.config import (
 from dptse_env.estimators import EstimatorSettings, HorizonSettings
 from dptse_env.estimators.tuned import available_settings, load_settings
 from dptse_env.parts import make_release, make_task, privacy_report, warn_where_void
-from dptse_env.release import MOST_OPTIONS, RELEASE_MODELS, CappedSettings, PrivacySettings
+from dptse_env.release import MOST_QUERIES, RELEASE_MODELS, CappedSettings, PrivacySettings
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
 from tests.helpers import SHORT, MeanRelease, SumRelease
 
@@ -232,7 +232,7 @@ BAD_QUERIES = [
     ({"bandwidth_unit": "queries"}, "bandwidth_unit must be"),
     ({"query_spans": [3, 4]}, r"bandwidth must be in 3\.\.6"),
     ({"bandwidth": 7}, r"bandwidth must be in 1\.\.6"),
-    (LONG_ROAD, rf"query_spans must leave at most {MOST_OPTIONS} .*, got 15050$"),
+    (LONG_ROAD, rf"query_spans must leave at most {MOST_QUERIES} .*, got 15050$"),
     ({"privacy": MeanRelease, "query_spans": (1, 2)}, r"query_spans must be \(1,\) where mean"),
     *[
         ({"privacy": preset, "query_spans": [1, 2]}, rf"query_spans must be .* model '{preset}'")

@@ -329,7 +329,7 @@ def plan(config, trips, likely, generator):
     """Flags of the options that are asked in each second, (T + 1, G): where the vehicle is, or
     some, each as likely."""
     options = config.queries
-    asked = generator.random((DURATION + 1, options.n_options)) < likely
+    asked = generator.random((DURATION + 1, options.n_queries)) < likely
     if likely == 0.0:
         places = np.concatenate([places for places, _ in trips])
         covers = np.pad(options.covers, [(0, 0), (0, PLACES + 1 - options.n_mainline)])

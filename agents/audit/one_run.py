@@ -1,10 +1,10 @@
 """An attack in one run: many vehicles, each with a coin, and one transcript of all of them.
 
-Time is cut into slots of equal length. In a slot, query options that share no segment have one
+Time is cut into slots of equal length. In a slot, queries that share no segment have one
 canary each, a vehicle that is on the road in this slot alone: so no number of a release depends on
 two of them. Its coin says whether it stands or drives at the speed limit, or, with a pair of
-options, on which of the two it stands. Where vehicles are added or removed, it stands or is not
-there. The options are queried as often as the bandwidth allows.
+queries, on which of the two it stands. Where vehicles are added or removed, it stands or is not
+there. They are made as often as the bandwidth allows.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Design:
         kind: What a coin decides, one of `KINDS`.
         slot: Length of a slot [s].
         canaries: Trajectory of each of the n canaries by its coin.
-        plan: Options to query by step, shape (horizon, G).
+        plan: Queries of each step, shape (horizon, G).
         owner: The canary that a column of a release may tell of, by step, shape (horizon, C); n
             where there is none.
     """
@@ -112,17 +112,17 @@ def make_design(config: EnvConfig, slot: int, kind: str) -> Design:
     Args:
         config: The configuration under attack.
         slot: Length of a slot.
-        kind: What a coin decides, one of `KINDS`; ``elsewhere`` takes two options that share no
+        kind: What a coin decides, one of `KINDS`; ``elsewhere`` takes two queries that share no
             segment.
     """
     task, size = make_task(config), 2 if kind == "elsewhere" else 1
     queries, sites = task.queries, apart(task)
     sites = sites[: len(sites) // size * size]
     at_once = int(np.count_nonzero(np.cumsum(queries.cost[sites]) <= queries.bandwidth))
-    # Where only one query can be paid for, the two options of a pair take turns.
+    # Where only one query can be paid for, the two queries of a pair take turns.
     n_used = max(at_once // size * size, size)
     canaries: list[tuple[Trajectory, Trajectory]] = []
-    plan = np.zeros((config.horizon_steps, queries.n_options), dtype=bool)
+    plan = np.zeros((config.horizon_steps, queries.n_queries), dtype=bool)
     owner = np.full((config.horizon_steps, task.n_channels), -1)
     for first in range(0, config.horizon_steps - slot + 1, slot):
         seconds = np.arange(first, first + slot)
@@ -148,15 +148,15 @@ def make_design(config: EnvConfig, slot: int, kind: str) -> Design:
 
 
 def apart(task: Task) -> IntArray:
-    """Return query options that share no segment; the cheapest come first."""
+    """Return queries that share no segment; the cheapest come first."""
     taken, sites = np.zeros(task.n_cells, dtype=bool), []
-    for option in np.argsort(task.queries.cost, kind="stable").tolist():
-        covered = task.covers[option]
+    for query in np.argsort(task.queries.cost, kind="stable").tolist():
+        covered = task.covers[query]
         if not (covered & taken).any():
             taken |= covered
-            sites.append(option)
+            sites.append(query)
     return np.array(
-        sorted(sites, key=lambda option: int(task.channels.first[option])), dtype=np.int64
+        sorted(sites, key=lambda query: int(task.channels.first[query])), dtype=np.int64
     )
 
 

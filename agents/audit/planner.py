@@ -11,7 +11,7 @@ from agents.audit.attack import attack, overheard
 from agents.audit.worlds import AdjacentWorlds, Trajectory
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface, make_release
-from dptse_env.release import QueryOptions
+from dptse_env.release import Queries
 from dptse_env.release.vehicles import Terms
 from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import Record
@@ -49,10 +49,10 @@ def public_plan(config: EnvConfig, name: str) -> BoolArray:
 
 
 def random_plan(
-    queries: QueryOptions, n: int, generator: np.random.Generator, first: BoolArray | None = None
+    queries: Queries, n: int, generator: np.random.Generator, first: BoolArray | None = None
 ) -> BoolArray:
     """Return as many random queries as can be paid for n times, some of them first, (n, G)."""
-    order = generator.random((n, queries.n_options))
+    order = generator.random((n, queries.n_queries))
     if first is not None:
         order -= first
     ranked = np.argsort(order, axis=1)
@@ -87,8 +87,8 @@ class Planner:
         self._release, corridor = make_release(config), config.corridor
         self._is_whole = self._release.task.is_whole
         self._queries = queries = self._release.task.queries
-        # The option to ask for each segment, shape (n_mainline,): the cheapest.
-        self._option = np.argmin(np.where(queries.covers.T, queries.cost, math.inf), axis=1)
+        # The query to ask for each segment, shape (n_mainline,): the cheapest.
+        self._query = np.argmin(np.where(queries.covers.T, queries.cost, math.inf), axis=1)
         ledgers = getattr(self._release, "ledgers", None)
         terms = Terms(np.full(1, math.inf)) if ledgers is None else ledgers.terms
         self._clip, self._fastest = terms.clip, float(terms.fastest)
@@ -137,7 +137,7 @@ class Planner:
     def _made_up(self, record: Record, kind: str) -> list[AdjacentWorlds]:
         """Return worlds that differ in made-up vehicles."""
         here, *others = self._places(record)
-        there = next(each for each in others if self._option[each] != self._option[here])
+        there = next(each for each in others if self._query[each] != self._query[here])
         stands = Trajectory.constant(self._seconds, here, 0.0)
         added = f"an added vehicle that stands on segment {here}"
         if not self.replaces:
@@ -273,19 +273,19 @@ class Planner:
             candidates += seconds
             left.append(budget)
 
-        def ask(step: int, option: int) -> bool:
+        def ask(step: int, query: int) -> bool:
             # Where both trajectories meet, one query serves both.
-            plan[step, option] |= cost[plan[step]].sum() + cost[option] <= bandwidth
-            return bool(plan[step, option])
+            plan[step, query] |= cost[plan[step]].sum() + cost[query] <= bandwidth
+            return bool(plan[step, query])
 
         for _, step, segment, world in sorted(candidates):
-            if left[world] and ask(step, self._option[segment]):
+            if left[world] and ask(step, self._query[segment]):
                 left[world] -= 1
         # Ledgers are spent by then, and should refuse the rest.
         spent = int(np.flatnonzero(plan.any(axis=1)).max(initial=-1))
         for _, step, segment, _ in candidates:
             if step > spent:
-                ask(step, self._option[segment])
+                ask(step, self._query[segment])
         if self._release.has_prices and self._is_whole:
             # What is left of the bandwidth goes round all segments. That keeps the estimator, and
             # so centres and prices, as they are in a typical episode.

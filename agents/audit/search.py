@@ -39,7 +39,7 @@ class Pair:
     Attributes:
         place: Record column of each trip by second, -1 where it is not there, shape (2, T).
         speed: Its speed [km/h], shape (2, T).
-        plan: Options that are queried, shape (T, G).
+        plan: Queries that are made, shape (T, G).
     """
 
     place: IntArray
@@ -122,7 +122,7 @@ class Mutations:
         plan, at = pair.plan.copy(), np.arange(len(pair.plan))[seconds]
         follows = generator.random((2, 1)) < 0.5
         there = np.where(follows, pair.place[:, at], -1)
-        covers = self._covers[: self._queries.n_options]
+        covers = self._covers[: self._queries.n_queries]
         sees = covers[:, there] & (there >= 0)
         first = (sees[:, 0] | sees[:, 1]).T
         plan[at] = random_plan(self._queries, len(at), generator, first)

@@ -212,7 +212,7 @@ class PlackettLuceSettings(Algorithm):
             self.make_policies(worlds)
         for world in worlds if self.swaps.rounds else ():
             queries, horizon = world.config.queries, world.config.horizon_steps
-            preset, n = world.config.privacy.preset, queries.n_options
+            preset, n = world.config.privacy.preset, queries.n_queries
             least = first_second(horizon) + 2 * self.swaps.seconds - 1
             where = f"where algorithm.swaps.rounds is {self.swaps.rounds}"
             name, model = RELEASE_MODELS.name_of(preset), RELEASE_MODELS.find(preset)

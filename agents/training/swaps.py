@@ -57,8 +57,8 @@ class Swaps:
         observations: Of the states, shape (m, size).
         error: Mean one-second error, minus the reward, over the seconds after a state, shape (m,).
         state: Index of the state in which each swap was tried, shape (k,).
-        added: Option that was queried, shape (k,).
-        dropped: Option that was queried without the swap, shape (k,).
+        added: Query that was made, shape (k,).
+        dropped: Query that was made without the swap, shape (k,).
         gain: Decrease of the summed error over these seconds due to the swap, shape (k,).
         spent: Increase of the budgets that vehicles spend in them, shape (k,); zero where they
             have none.
@@ -134,7 +134,7 @@ def _tried(
     columns = before.release.task.n_channels
     noise = generator.choice([-1.0, 1.0], size=(n, columns, 2))
     reward, spent = _replayed(before, actions, noise)
-    queried = np.zeros((n, before.interface.queries.n_options), dtype=bool)
+    queried = np.zeros((n, before.interface.queries.n_queries), dtype=bool)
     np.put_along_axis(queried, actions[0], True, axis=1)
     parts = []
     for _ in range(trials):

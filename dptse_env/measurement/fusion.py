@@ -61,7 +61,7 @@ class Fusion:
         """Prepare for the queries of a task, with the published share p of connected vehicles."""
         self.settings, self.share = settings, share
         self.releases_flow = task.releases_flow
-        self._queries = queries = slice(0, task.queries.n_options)
+        self._queries = queries = slice(0, task.queries.n_queries)
         self._length = task.channels.length[queries]
         self._limit = task.corridor.road.limits[task.channels.first[queries]]
         covers = task.covers[queries, : task.corridor.road.n_segments]

@@ -11,7 +11,7 @@ from dptse_env.release.gaussian import (
 from dptse_env.release.model import ReleaseModel, check_released
 from dptse_env.release.paced import Paced, PacedSettings
 from dptse_env.release.pacing import Pacing
-from dptse_env.release.queries import MOST_OPTIONS, BandwidthUnit, QueryOptions
+from dptse_env.release.queries import MOST_QUERIES, BandwidthUnit, Queries
 from dptse_env.release.report import VOID_REASONS, PrivacyReport, QuantityReport
 from dptse_env.release.settings import BoundaryInputs, PrivacySettings
 from dptse_env.release.task import Group, Request, Task
@@ -32,7 +32,7 @@ theorem needs, with capped contributions, and with paced ledgers; the last two g
 every query policy."""
 
 __all__ = [
-    "MOST_OPTIONS",
+    "MOST_QUERIES",
     "RELEASE_MODELS",
     "VOID_REASONS",
     "BandwidthUnit",
@@ -49,7 +49,7 @@ __all__ = [
     "PrivacyReport",
     "PrivacySettings",
     "QuantityReport",
-    "QueryOptions",
+    "Queries",
     "ReleaseModel",
     "Request",
     "Task",

@@ -257,7 +257,7 @@ class Paced(ReleaseModel):
         (k, n_mainline); then ``centre_fallback`` is 1.
         """
         return {
-            "prices": self.prices.take(episodes, 0)[:, : self.task.queries.n_options],
+            "prices": self.prices.take(episodes, 0)[:, : self.task.queries.n_queries],
             "spent_share": self.pacing.spent_share(episodes),
             "centre_fallback": self._fallback[episodes],
         }

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.release.queries import QueryOptions
+from dptse_env.release.queries import Queries
 from dptse_env.release.task import Task
 from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -148,12 +148,12 @@ class TripPacing(Pacing):
         return part
 
 
-def _coverage(options: QueryOptions) -> float:
-    """Return the share of the mainline that a step's queries cover if all options are alike."""
-    if options.n_options == 0:
+def _coverage(queries: Queries) -> float:
+    """Return the share of the mainline that a step's queries cover if all queries are alike."""
+    if queries.n_queries == 0:
         return 0.0
-    bought = options.bandwidth * float(np.mean(options.span / options.cost))
-    return min(bought / options.n_mainline, 1.0)
+    bought = queries.bandwidth * float(np.mean(queries.span / queries.cost))
+    return min(bought / queries.n_mainline, 1.0)
 
 
 class EventPacing(Pacing):

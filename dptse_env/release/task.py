@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dptse_env.estimators import Estimate
 from dptse_env.model import Channels
-from dptse_env.release.queries import QueryOptions
+from dptse_env.release.queries import Queries
 from dptse_env.traffic import Corridor, Penetration
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
@@ -44,7 +44,7 @@ class Task:
         name: Name of the release model, for reports.
         settings: Its settings, of its ``settings_type``.
         corridor: The road, with the scales of densities and speeds.
-        queries: The queries that can be chosen, the first G channels, and their bandwidth.
+        queries: The queries to choose from, the first G channels, and their bandwidth.
         horizon: Steps of an episode.
         centre: Speed v_0 [km/h] that released flows are centred on; None where mean speeds
             are released.
@@ -57,7 +57,7 @@ class Task:
     name: str
     settings: Any
     corridor: Corridor
-    queries: QueryOptions
+    queries: Queries
     horizon: int
     centre: float | None = None
     has_prices: bool = False
@@ -87,7 +87,7 @@ class Task:
         boundary = np.arange(road.n_segments, self.n_cells)
         first = np.concatenate([queries.first, others, boundary])
         span = np.concatenate([queries.span, np.ones(others.size + boundary.size, dtype=np.int64)])
-        group = np.where(np.arange(first.size) < queries.n_options, 0, len(self.groups) - 1)
+        group = np.where(np.arange(first.size) < queries.n_queries, 0, len(self.groups) - 1)
         return Channels(first, span, group, road.lengths[first] * span)
 
     @cached_property

@@ -143,6 +143,6 @@ class ActingPolicy:
         return self.policy.predict(observation, state, episode_start, deterministic, **extra)
 
     def _masks(self, observation: Observation) -> BoolArray:
-        """Return the options that may be picked next, (G,) or (k, G)."""
+        """Return the queries that may be picked next, (G,) or (k, G)."""
         picked = self.interface.picked(observation)
         return self.interface.actions.available(np.atleast_2d(picked)).reshape(picked.shape)

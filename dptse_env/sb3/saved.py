@@ -373,7 +373,7 @@ def _check_shared(arguments: Mapping[str, Any], kind: Kind, n_values: int) -> No
 def _perceptron(
     name: str, arguments: Mapping[str, Any], interface: QueryInterface, n_values: int
 ) -> BasePolicy:
-    kind, n_actions = KINDS[name], interface.actions.n_options
+    kind, n_actions = KINDS[name], interface.actions.n_queries
     _check_names(arguments, ("layers", "units", *kind.sizes))
     layers, units = arguments["layers"], arguments["units"]
     require(isinstance(layers, list), "policy.arguments.layers", "a list of widths", layers)

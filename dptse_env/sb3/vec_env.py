@@ -164,7 +164,7 @@ class SB3VecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Return the masks of sequential actions, each of shape (n_options,), for `action_masks`.
+        """Return the masks of sequential actions, each of shape (n_queries,), for `action_masks`.
 
         Raises:
             AttributeError: The method is another one, or the actions are not sequential.

@@ -12,7 +12,7 @@ import numpy as np
 
 from dptse_env.parts import QueryInterface
 from dptse_env.process import QueryProcess
-from dptse_env.release import QueryOptions
+from dptse_env.release import Queries
 from dptse_env.spaces.actions import first_that_fit
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.registry import Registry, name_of_class
@@ -87,7 +87,7 @@ class ScheduleState(NamedTuple):
 
     Attributes:
         step: Decisions completed in the episode, shape (k,).
-        wanted: The options of the decision in progress, shape (k, G).
+        wanted: The queries of the decision in progress, shape (k, G).
     """
 
     step: IntArray
@@ -95,10 +95,10 @@ class ScheduleState(NamedTuple):
 
 
 class Schedule(ABC):
-    """A query policy that needs no training; subclasses choose options in `select`.
+    """A query policy that needs no training; subclasses choose queries in `select`.
 
-    Options are the mainline segments, unless the environment has other spans
-    (`dptse_env.release.QueryOptions`).
+    Queries are the mainline segments, unless the environment has other spans
+    (`dptse_env.release.Queries`).
 
     Attributes:
         queries: The G options.
@@ -120,7 +120,7 @@ class Schedule(ABC):
 
     @abstractmethod
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
-        """Return the options to query, shape (k, G).
+        """Return the chosen queries, shape (k, G).
 
         Args:
             step: Decisions completed so far in each episode, shape (k,).
@@ -165,7 +165,7 @@ class Schedule(ABC):
     ) -> tuple[IntArray, BoolArray]:
         if state is None:
             step = np.zeros(k, dtype=np.int64)
-            wanted = np.zeros((k, self.queries.n_options), dtype=bool)
+            wanted = np.zeros((k, self.queries.n_queries), dtype=bool)
         else:
             step, wanted = np.array(state[0]), np.array(state[1])
         if episode_start is not None:
@@ -177,26 +177,26 @@ class Schedule(ABC):
         return self.interface.observations.block(observation, name)
 
     def mask(self, chosen: IntArray) -> BoolArray:
-        """Return flags (k, G) of the chosen options, given their indices (k, m) for any m."""
-        mask = np.zeros((len(chosen), self.queries.n_options), dtype=bool)
+        """Return flags (k, G) of the chosen queries, given their indices (k, m) for any m."""
+        mask = np.zeros((len(chosen), self.queries.n_queries), dtype=bool)
         np.put_along_axis(mask, chosen, True, axis=1)
         return mask
 
     def first_that_fit(self, order: IntArray) -> BoolArray:
-        """Return the mask of the first options of an order (k, G) that the bandwidth pays for.
+        """Return the mask of the first queries of an order (k, G) that the bandwidth pays for.
 
-        An option that costs more than is left is passed over.
+        A query that costs more than is left is passed over.
         """
         return first_that_fit(order, self.queries.cost, self.bandwidth)
 
     def highest(self, value: FloatArray | Observation, step: IntArray) -> BoolArray:
-        """Return the options of the highest value that the bandwidth pays for, shape (k, G).
+        """Return the queries of the highest value that the bandwidth pays for, shape (k, G).
 
         Ties rotate along the road with the step: breaking them from one end would query the
         segments there 1.5 times as often. A mainline segment with a fixed sensor is observed
         without a query, so it comes last for any value.
 
-        Other options are chosen as `best_options` says.
+        Other queries are chosen as `best_queries` says.
 
         Args:
             value: Value of each mainline segment, shape (k, n_mainline); none below 0 where costs
@@ -211,11 +211,11 @@ class Schedule(ABC):
             score[:, fixed] = -np.inf
             turn = (np.arange(self.n_mainline) - step[:, None]) % self.n_mainline
             return self.first_that_fit(np.lexsort((turn, -score), axis=1))
-        return best_options(self.queries, score, fixed, step)
+        return best_queries(self.queries, score, fixed, step)
 
 
 def require_plain(interface: QueryInterface, name: str) -> None:
-    """Refuse options other than the mainline segments.
+    """Refuse queries other than the mainline segments.
 
     Raises:
         ValueError: There are others; ``name`` is the schedule's.
@@ -260,12 +260,10 @@ class ProcessSchedule(Schedule):
     ) -> BoolArray: ...
 
 
-def best_options(
-    queries: QueryOptions, value: FloatArray, fixed: IntArray, step: IntArray
-) -> BoolArray:
-    """Return the options of the highest `option_values` that the bandwidth pays for, shape (k, G).
+def best_queries(queries: Queries, value: FloatArray, fixed: IntArray, step: IntArray) -> BoolArray:
+    """Return the queries of the highest `query_values` that the bandwidth pays for, shape (k, G).
 
-    They do not overlap. Where bandwidth is left that pays for no such option, it is used for
+    They do not overlap. Where bandwidth is left that pays for no such query, it is used for
     others. Ties rotate along the road with the step.
 
     Args:
@@ -274,29 +272,29 @@ def best_options(
         fixed: Mainline segments with a fixed sensor.
         step: Steps of the episode so far, shape (k,).
     """
-    score = option_values(queries, value, fixed)
+    score = query_values(queries, value, fixed)
     turn = (queries.first - step[:, None]) % queries.n_mainline
     order = np.lexsort((turn, -score), axis=1)
     chosen, every = np.zeros(score.shape, dtype=bool), np.arange(len(score))
     left = np.full(len(score), queries.bandwidth)
     covered = np.zeros((len(score), queries.n_mainline), dtype=bool)
     for is_distinct in (True, False):
-        for option in order.T:
+        for query in order.T:
             if (left < queries.cost.min()).all():
                 return chosen
-            fits = (queries.cost[option] <= left) & ~chosen[every, option]
+            fits = (queries.cost[query] <= left) & ~chosen[every, query]
             if is_distinct:
-                fits &= ~(covered & queries.covers[option]).any(axis=1)
-            chosen[every, option] |= fits
-            covered |= queries.covers[option] & fits[:, None]
-            left -= np.where(fits, queries.cost[option], 0)
+                fits &= ~(covered & queries.covers[query]).any(axis=1)
+            chosen[every, query] |= fits
+            covered |= queries.covers[query] & fits[:, None]
+            left -= np.where(fits, queries.cost[query], 0)
     return chosen
 
 
-def option_values(queries: QueryOptions, value: FloatArray, fixed: IntArray) -> FloatArray:
-    """Return the mean values of the options' segments, shape (k, G), per unit of cost.
+def query_values(queries: Queries, value: FloatArray, fixed: IntArray) -> FloatArray:
+    """Return the mean values of the queries' segments, shape (k, G), per unit of cost.
 
-    A segment with a fixed sensor counts as the least of the others; an option of such segments
+    A segment with a fixed sensor counts as the least of the others; a query of such segments
     alone has minus infinity.
     """
     free = np.delete(np.arange(queries.n_mainline), fixed)

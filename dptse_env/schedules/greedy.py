@@ -83,7 +83,7 @@ class GreedyTrace(ProcessSchedule):
         """Bind the schedule to a process (``env.unwrapped.process``).
 
         Raises:
-            ValueError: The estimator has no covariance, or options are not the mainline segments.
+            ValueError: The estimator has no covariance, or queries are not the mainline segments.
         """
         super().__init__(process, seed)
         require_plain(process.interface, self.name)

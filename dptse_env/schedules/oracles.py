@@ -54,7 +54,7 @@ class OracleGain(ProcessSchedule):
         """Bind the schedule.
 
         Raises:
-            ValueError: Options are not the mainline segments, or the noise of the release model
+            ValueError: Queries are not the mainline segments, or the noise of the release model
                 cannot be set.
         """
         super().__init__(process, seed)

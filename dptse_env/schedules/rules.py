@@ -17,7 +17,7 @@ class Nothing(Schedule):
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
-        return np.zeros((len(step), self.queries.n_options), dtype=bool)
+        return np.zeros((len(step), self.queries.n_queries), dtype=bool)
 
 
 class Everything(Schedule):
@@ -55,7 +55,7 @@ class Shifting(Schedule):
     The set starts at floor(n i / B) for i = 0 .. B-1; segments beyond the downstream end continue
     upstream.
 
-    Among several spans it keeps to the smallest one: n is the number of its options, and B how many
+    Among several spans it keeps to the smallest one: n is the number of its queries, and B how many
     of them the bandwidth pays for.
     """
 
@@ -66,15 +66,15 @@ class Shifting(Schedule):
         super().__init__(interface, seed)
         queries = self.queries
         own = queries.span == queries.span.min()
-        self._options = np.flatnonzero(own)
-        n = self._options.size
+        self._queries = np.flatnonzero(own)
+        n = self._queries.size
         size = min(self.bandwidth // int(queries.cost[own][0]), n)
         self._start = np.arange(size) * n // size
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
-        place = (self._start + step[:, None] // self.period) % self._options.size
-        chosen = self.mask(self._options[place])
+        place = (self._start + step[:, None] // self.period) % self._queries.size
+        chosen = self.mask(self._queries[place])
         # What is left of the bandwidth goes to the first of the others.
         return self.first_that_fit(np.argsort(~chosen, axis=1, kind="stable"))
 
@@ -98,11 +98,11 @@ class RoundRobin(Shifting):
 
 
 class Random(Schedule):
-    """A random set of options at every step, as many as the bandwidth pays for."""
+    """A random set of queries at every step, as many as the bandwidth pays for."""
 
     def select(self, step: IntArray, observation: Observation) -> BoolArray:
         """See `Schedule.select`."""
-        keys = self.generator.random((len(step), self.queries.n_options))
+        keys = self.generator.random((len(step), self.queries.n_queries))
         return self.first_that_fit(np.argsort(keys, axis=1))
 
 
@@ -239,7 +239,7 @@ class SpeedFront(Schedule):
         before = np.ones((k, n)) if state is None else np.array(state[2])
         if episode_start is not None:
             before[np.broadcast_to(episode_start, (k,)).astype(bool)] = 1.0
-        squares = np.zeros((k, self.queries.n_options))
+        squares = np.zeros((k, self.queries.n_queries))
         for name in ("density_innovation", "speed_innovation"):
             squares += 0.5 * self.block(batch, name).astype(np.float64) ** 2
         # While the picks of a second are made one by one, the same measurements are seen again.

@@ -1,14 +1,14 @@
 """Action encodings: from a policy's action to what is queried.
 
 Every encoding turns a batch of actions into queries that the bandwidth pays for, and turns a set of
-queries back into an action. What can be queried are options: the mainline segments, or, with other
-spans, those of `dptse_env.release.QueryOptions`. An encoding holds its Gymnasium
+queries back into an action. The queries to choose from are the mainline segments, or, with other
+spans, those of `dptse_env.release.Queries`. An encoding holds its Gymnasium
 space, so the two cannot drift apart, and no state: the state between actions is part of the process
 (`PendingPicks`). Surplus requests are dropped, and missing ones added, from a rotating pointer that
 does not depend on the traffic.
 
 Any action that the space can sample is valid. A wrong shape, a wrong dtype, a NaN or an index
-beyond the options raises ``ValueError``.
+beyond the queries raises ``ValueError``.
 """
 
 from abc import ABC, abstractmethod
@@ -17,7 +17,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from dptse_env.release import QueryOptions
+from dptse_env.release import Queries
 from dptse_env.utils.arrays import Action, BoolArray, IntArray
 from dptse_env.utils.kernels import kernel
 from dptse_env.utils.registry import Registry, name_of_class
@@ -27,15 +27,15 @@ class PendingPicks:
     """State of n episodes between actions.
 
     Attributes:
-        picked: Options picked so far for a decision in progress, shape (n, n_options); always empty
+        picked: Queries picked so far for a decision in progress, shape (n, n_queries); always empty
             but for encodings that pick one by one.
-        pointer: Option from which requests are kept or added next, shape (n,).
+        pointer: Query from which requests are kept or added next, shape (n,).
         n_replaced: Picks of the decision in progress that were replaced, shape (n,).
     """
 
-    def __init__(self, n_episodes: int, n_options: int) -> None:
+    def __init__(self, n_episodes: int, n_queries: int) -> None:
         """Make the state of n episodes without any pick."""
-        self.picked = np.zeros((n_episodes, n_options), dtype=bool)
+        self.picked = np.zeros((n_episodes, n_queries), dtype=bool)
         self.pointer = np.zeros(n_episodes, dtype=np.int64)
         self.n_replaced = np.zeros(n_episodes, dtype=np.int64)
 
@@ -48,16 +48,16 @@ class PendingPicks:
     def in_turn(
         self, episodes: IntArray, wanted: BoolArray, limit: IntArray, costs: IntArray
     ) -> BoolArray:
-        """Keep wanted options (k, n) from the pointer on, and move it past them.
+        """Keep wanted queries (k, n) from the pointer on, and move it past them.
 
-        An option that costs more than is left is passed over, and the pointer stops there, so that
+        A query that costs more than is left is passed over, and the pointer stops there, so that
         it comes first in the next turn.
 
         Args:
             episodes: Shape (k,).
             wanted: Shape (k, n).
-            limit: Largest total cost of the kept options of an episode, shape (k,).
-            costs: Of the options, at least 1 each, shape (n,).
+            limit: Largest total cost of the kept queries of an episode, shape (k,).
+            costs: Of the queries, at least 1 each, shape (n,).
         """
         kept = np.zeros_like(wanted)
         _keep_in_turn(episodes, wanted, limit, costs, self.pointer, kept)
@@ -78,24 +78,24 @@ def _keep_in_turn(
     for k in range(episodes.size):
         first, left, is_passed_over = pointer[episodes[k]], limit[k], False
         for turn in range(n):
-            option = (first + turn) % n
-            if wanted[k, option] and costs[option] <= left:
-                kept[k, option] = True
-                left -= costs[option]
+            query = (first + turn) % n
+            if wanted[k, query] and costs[query] <= left:
+                kept[k, query] = True
+                left -= costs[query]
                 if not is_passed_over:
-                    pointer[episodes[k]] = (option + 1) % n
-            elif wanted[k, option] and costs[option] <= limit[k]:
+                    pointer[episodes[k]] = (query + 1) % n
+            elif wanted[k, query] and costs[query] <= limit[k]:
                 is_passed_over = True
 
 
 def first_that_fit(order: IntArray, costs: IntArray, limit: int) -> BoolArray:
-    """Return the first options of an order that a limit pays for, flags of shape (k, n).
+    """Return the first queries of an order that a limit pays for, flags of shape (k, n).
 
-    An option that costs more than is left is passed over.
+    A query that costs more than is left is passed over.
 
     Args:
-        order: The options, best first, shape (k, n).
-        costs: Of the options, shape (n,).
+        order: The queries, best first, shape (k, n).
+        costs: Of the queries, shape (n,).
         limit: Their largest total cost.
     """
     kept, every = np.zeros(order.shape, dtype=bool), np.arange(len(order))
@@ -103,10 +103,10 @@ def first_that_fit(order: IntArray, costs: IntArray, limit: int) -> BoolArray:
         kept[every[:, None], order[:, : limit // costs[0]]] = True
         return kept
     left = np.full(len(order), limit)
-    for option in order.T:
-        fits = costs[option] <= left
-        kept[every, option] = fits
-        left -= np.where(fits, costs[option], 0)
+    for query in order.T:
+        fits = costs[query] <= left
+        kept[every, query] = fits
+        left -= np.where(fits, costs[query], 0)
         if not left.any():
             break
     return kept
@@ -116,7 +116,7 @@ class Decision(NamedTuple):
     """The queries of a batch of actions.
 
     Attributes:
-        queried: Options to query, shape (k, n_options).
+        queried: Queries to query, shape (k, n_queries).
         n_dropped: Number of requests that were dropped, repeated or replaced, shape (k,).
         complete: Whether the decision is complete, shape (k,). Only encodings that pick one by one
             need several actions for a decision.
@@ -130,24 +130,24 @@ class Decision(NamedTuple):
 class ActionEncoding(ABC):
     """Base class of the encodings.
 
-    An option is a mainline segment, unless the environment has other spans
-    (`dptse_env.release.QueryOptions`).
+    A query is a mainline segment, unless the environment has other spans
+    (`dptse_env.release.Queries`).
 
     Attributes:
         space: The Gymnasium space of one action.
-        n_options: Options that can be queried, n.
+        n_queries: Queries to choose from, n.
         bandwidth: Largest total cost of the queries of a step, B.
-        costs: Costs of the options, 1 each where they do not differ, shape (n,).
+        costs: Costs of the queries, 1 each where they do not differ, shape (n,).
         most_queries: Largest number of queries in a step.
-        picks_one_by_one: Whether an action picks one option, so that those which cannot be picked
+        picks_one_by_one: Whether an action picks one query, so that those which cannot be picked
             any more can be masked.
     """
 
     picks_one_by_one: ClassVar[bool] = False
 
-    def __init__(self, queries: QueryOptions) -> None:
+    def __init__(self, queries: Queries) -> None:
         """Store the sizes, and the space that they give."""
-        self.n_options, self.most_queries = queries.n_options, queries.most_queries
+        self.n_queries, self.most_queries = queries.n_queries, queries.most_queries
         self.bandwidth, self.costs = queries.bandwidth, queries.cost
         self.space = self.make_space()
         self._shape = self.space.shape or ()
@@ -163,7 +163,7 @@ class ActionEncoding(ABC):
 
     @abstractmethod
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
-        """Turn actions into options to query.
+        """Turn actions into queries.
 
         Args:
             episodes: The k episodes that act, indices into ``pending``.
@@ -176,18 +176,18 @@ class ActionEncoding(ABC):
 
     @abstractmethod
     def encode(self, queried: BoolArray, picked: BoolArray) -> Action:
-        """Turn wanted options, shape (k, n_options), into actions of this encoding.
+        """Turn wanted queries, shape (k, n_queries), into actions of this encoding.
 
         Args:
-            queried: Wanted options, shape (k, n_options).
-            picked: Options already chosen for this decision, shape (k, n_options).
+            queried: Wanted queries, shape (k, n_queries).
+            picked: Queries already chosen for this decision, shape (k, n_queries).
 
         Raises:
             ValueError: The encoding cannot express that set of options.
         """
 
     def available(self, picked: BoolArray) -> BoolArray:
-        """Return flags (k, n_options) of what a decision may have beside the picked options.
+        """Return flags (k, n_queries) of what a decision may have beside the picked options.
 
         They are not picked yet, and do not cost more than is left of the bandwidth.
         """
@@ -204,7 +204,7 @@ class ActionEncoding(ABC):
     def _cut(
         self, episodes: IntArray, wanted: BoolArray, pending: PendingPicks
     ) -> tuple[BoolArray, IntArray]:
-        """Cut options (k, n_options) in rotation; return the rest, and how many were cut (k,)."""
+        """Cut queries (k, n_queries) in rotation; return the rest, and how many were cut (k,)."""
         over = wanted.dot(self.costs) > self.bandwidth
         if not np.count_nonzero(over):  # faster than any()
             return wanted, np.zeros(len(wanted), dtype=np.int64)
@@ -226,7 +226,7 @@ class ActionEncoding(ABC):
         return array
 
     def _checked_indices(self, episodes: IntArray, actions: Action) -> IntArray:
-        array, last = self._checked(episodes, actions), self.n_options - 1
+        array, last = self._checked(episodes, actions), self.n_queries - 1
         if array.dtype.kind not in "iu":
             raise ValueError(f"action must hold integers for {self.space}, got {array.dtype}")
         if np.count_nonzero((array < 0) | (array > last)):
@@ -234,7 +234,7 @@ class ActionEncoding(ABC):
         return array.astype(np.int64)
 
     def _require_full(self, queried: BoolArray) -> None:
-        """Refuse sets to which another option could be added."""
+        """Refuse sets to which another query could be added."""
         cost = queried @ self.costs
         if (cost > self.bandwidth).any() or self.available(queried).any():
             raise ValueError(
@@ -245,7 +245,7 @@ class ActionEncoding(ABC):
 
 def check_decision(encoding: ActionEncoding, decision: Any, n_actions: int) -> None:
     """Refuse a decision of another package that is malformed or exceeds the bandwidth."""
-    name, shape = name_of_class(encoding), (n_actions, encoding.n_options)
+    name, shape = name_of_class(encoding), (n_actions, encoding.n_queries)
     queried, complete = np.asarray(decision.queried), np.asarray(decision.complete)
     expected = {"queried": (queried, shape), "complete": (complete, shape[:1])}
     for field, (flags, flags_shape) in expected.items():
@@ -269,7 +269,7 @@ def check_decision(encoding: ActionEncoding, decision: Any, n_actions: int) -> N
 
 
 class MaskAction(ActionEncoding):
-    """``MultiBinary(n)``: one flag per option.
+    """``MultiBinary(n)``: one flag per query.
 
     Requests beyond the bandwidth are dropped in rotation. Arrays of any real dtype are accepted if
     all values are exactly 0 or 1, since learning libraries send flags as floats.
@@ -277,7 +277,7 @@ class MaskAction(ActionEncoding):
 
     def make_space(self) -> spaces.Space[Any]:
         """See `ActionEncoding.make_space`."""
-        return spaces.MultiBinary(self.n_options)
+        return spaces.MultiBinary(self.n_queries)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
@@ -293,14 +293,14 @@ class MaskAction(ActionEncoding):
 
 
 class ScoresAction(ActionEncoding):
-    """``Box(-1, 1, (n,))``: the options of highest score, as many as the bandwidth pays for.
+    """``Box(-1, 1, (n,))``: the queries of highest score, as many as the bandwidth pays for.
 
-    An option that costs more than is left is passed over. Ties go to the first option, upstream.
+    A query that costs more than is left is passed over. Ties go to the first query, upstream.
     """
 
     def make_space(self) -> spaces.Space[Any]:
         """See `ActionEncoding.make_space`."""
-        return spaces.Box(-1.0, 1.0, (self.n_options,), np.float32)
+        return spaces.Box(-1.0, 1.0, (self.n_queries,), np.float32)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
@@ -319,20 +319,20 @@ class ScoresAction(ActionEncoding):
 
 
 class SlotsAction(ActionEncoding):
-    """``MultiDiscrete([n] * B)``: an option for each of the B queries, as many as there may be.
+    """``MultiDiscrete([n] * B)``: a query in each of B slots, as many as there may be.
 
-    Requests beyond the bandwidth are dropped in rotation; in place of repeats, options are added in
+    Requests beyond the bandwidth are dropped in rotation; in place of repeats, queries are added in
     rotation that the bandwidth pays for.
     """
 
     def make_space(self) -> spaces.Space[Any]:
         """See `ActionEncoding.make_space`."""
-        return spaces.MultiDiscrete([self.n_options] * self.most_queries)
+        return spaces.MultiDiscrete([self.n_queries] * self.most_queries)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
         slots = self._checked_indices(episodes, actions)
-        wanted = np.zeros((len(episodes), self.n_options), dtype=bool)
+        wanted = np.zeros((len(episodes), self.n_queries), dtype=bool)
         wanted[np.arange(len(slots))[:, None], slots] = True
         queried, n_dropped = self._cut(episodes, wanted, pending)
         left = self.bandwidth - queried.dot(self.costs)
@@ -353,10 +353,10 @@ class SlotsAction(ActionEncoding):
 
 
 class SequentialAction(ActionEncoding):
-    """``Discrete(n)``: one option per action, until the bandwidth pays for no further one.
+    """``Discrete(n)``: one query per action, until the bandwidth pays for no further one.
 
     The traffic does not advance until the last pick. Valid actions, for policies with masks, are
-    the options that are not picked yet and that the rest of the bandwidth pays for (`available`);
+    the queries that are not picked yet and that the rest of the bandwidth pays for (`available`);
     another pick is replaced in rotation.
     """
 
@@ -364,7 +364,7 @@ class SequentialAction(ActionEncoding):
 
     def make_space(self) -> spaces.Space[Any]:
         """See `ActionEncoding.make_space`."""
-        return spaces.Discrete(self.n_options)
+        return spaces.Discrete(self.n_queries)
 
     def decode(self, episodes: IntArray, actions: Action, pending: PendingPicks) -> Decision:
         """See `ActionEncoding.decode`."""
@@ -406,4 +406,4 @@ ACTION_ENCODINGS = Registry(
     },
     check=_expected,
 )
-"""Action encodings by name, each a class made of `QueryOptions`."""
+"""Action encodings by name, each a class made of `Queries`."""

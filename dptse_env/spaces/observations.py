@@ -37,13 +37,13 @@ class PublicState(NamedTuple):
     Attributes:
         estimate: Densities [veh/km], speeds [km/h] and their standard deviations, each (k, S).
         released: Last released (density [veh/km], speed [km/h] or flow [veh/h]) per row, the
-            options first, shape (k, M, 2); zero before the first release.
+            queries first, shape (k, M, 2); zero before the first release.
         innovations: Normalised innovations of the last update, shape (k, M, 2); zero where
             nothing was observed.
         age: Steps since each mainline segment was last observed, shape (k, n_mainline).
-        queried: The options that were last queried, shape (k, G).
-        picked: Options picked so far for the next query, shape (k, G).
-        prices: Price of the last query of each option, shape (k, G); zero where there was none.
+        queried: The queries that were last queried, shape (k, G).
+        picked: Queries picked so far for the next query, shape (k, G).
+        prices: Price of the last query of each query, shape (k, G); zero where there was none.
             None where queries have no prices.
         spent_share: The release model's public account of what a vehicle on each mainline segment
             has been charged on average, over its budget, in [0, 1], shape (k, n_mainline). None
@@ -129,8 +129,8 @@ def _mainline(task: Task) -> int:
     return task.corridor.geometry.n_mainline
 
 
-def _options(task: Task) -> int:
-    return task.queries.n_options
+def _queries(task: Task) -> int:
+    return task.queries.n_queries
 
 
 def _fixed(task: Task) -> int:
@@ -149,8 +149,8 @@ def _flow_scale(task: Task) -> float:
     return task.corridor.scales.density_scale * task.corridor.scales.speed_scale
 
 
-def _of_options(component: int) -> Callable[[Task], Any]:
-    return lambda task: (slice(None), slice(task.queries.n_options), component)
+def _of_queries(component: int) -> Callable[[Task], Any]:
+    return lambda task: (slice(None), slice(task.queries.n_queries), component)
 
 
 def _of_sensors(component: int) -> Callable[[Task], Any]:
@@ -172,23 +172,23 @@ SHIPPED_BLOCKS = (
     Block("density_log_std", _segments, -10, 5, "estimate.density_std", _density_scale,
           transform=_log),
     Block("speed_log_std", _segments, -10, 5, "estimate.speed_std", _speed_scale, transform=_log),
-    Block("released_density", _options, -5, 5, "released", _density_scale, _of_options(0)),
-    Block("released_speed", _options, -5, 5, "released", _speed_scale, _of_options(1),
+    Block("released_density", _queries, -5, 5, "released", _density_scale, _of_queries(0)),
+    Block("released_speed", _queries, -5, 5, "released", _speed_scale, _of_queries(1),
           is_default=lambda task, _: not task.releases_flow),
-    Block("released_flow", _options, -5, 5, "released", _flow_scale, _of_options(1),
+    Block("released_flow", _queries, -5, 5, "released", _flow_scale, _of_queries(1),
           is_default=lambda task, _: task.releases_flow),
-    Block("density_innovation", _options, -10, 10, "innovations", part=_of_options(0)),
-    Block("speed_innovation", _options, -10, 10, "innovations", part=_of_options(1)),
+    Block("density_innovation", _queries, -10, 10, "innovations", part=_of_queries(0)),
+    Block("speed_innovation", _queries, -10, 10, "innovations", part=_of_queries(1)),
     Block("age", _mainline, 0, 1, "age", lambda _: AGE_CAP),
-    Block("queried", _options, 0, 1, "queried"),
+    Block("queried", _queries, 0, 1, "queried"),
     Block("fixed_density_innovation", _fixed, -10, 10, "innovations", part=_of_sensors(0)),
     Block("fixed_speed_innovation", _fixed, -10, 10, "innovations", part=_of_sensors(1)),
     Block("bandwidth", lambda _: 1, 0, 1, "", lambda task: task.corridor.geometry.n_mainline,
           constant=lambda task: task.queries.bandwidth),
     Block("epsilon", lambda _: 1, -6, 6, "",
           constant=lambda task: float(np.log10(task.settings.epsilon))),
-    Block("picked", _options, 0, 1, "picked", is_default=lambda _, one_by_one: one_by_one),
-    Block("last_price", _options, -5, 5, "prices", lambda _: PRICE_UNIT, transform=_log_price,
+    Block("picked", _queries, 0, 1, "picked", is_default=lambda _, one_by_one: one_by_one),
+    Block("last_price", _queries, -5, 5, "prices", lambda _: PRICE_UNIT, transform=_log_price,
           is_default=lambda task, _: task.has_prices),
     Block("spent_share", _mainline, 0, 1, "spent_share",
           is_default=lambda task, _: task.has_prices),

@@ -54,7 +54,7 @@ class ScoredSecond(NamedTuple):
         true_density: Shape (k, n_mainline) [veh/km].
         true_speed: Shape (k, n_mainline) [km/h].
         estimate: Estimates and their standard deviations, shape (k, S) each.
-        queried: Queried options, shape (k, G): by default the mainline segments.
+        queried: Queried queries, shape (k, G): by default the mainline segments.
         corridor: The road, with the scales of densities and speeds.
     """
 

@@ -5,7 +5,7 @@ import pytest
 
 from dptse_env.estimators import Estimate, Measurement
 from dptse_env.measurement import Fusion, FusionSettings
-from dptse_env.release import CappedSettings, Corrected, Paced, PacedSettings, QueryOptions
+from dptse_env.release import CappedSettings, Corrected, Paced, PacedSettings, Queries
 from dptse_env.traffic import SHORT_HIGHWAY
 from tests.release.worlds import task_of
 
@@ -20,7 +20,7 @@ def read(values, share, sigma=1e-9, n=5, speed=60.0, *, flow=True, **settings):
     Its six mainline segments are queries; two ramps follow.
     """
     model, privacy = (Paced, PacedSettings()) if flow else (Corrected, CappedSettings())
-    task = task_of(model, privacy, SHORT_HIGHWAY, QueryOptions.make(N, 2))
+    task = task_of(model, privacy, SHORT_HIGHWAY, Queries.make(N, 2))
     fusion = Fusion(task, FusionSettings(speed_spread=SPREAD, **settings), share)
     everywhere, k = np.ones(values.shape[:2], dtype=bool), len(values)
     given = Measurement(everywhere, values, np.full(values.shape, sigma), np.full((k, S), CENTRE))
@@ -98,6 +98,6 @@ def test_deviations_of_noise_are_scaled_by_the_share():
     for model, settings, expected in (
         (Paced, PacedSettings(), [20.0, 30.0]), (Corrected, CappedSettings(), [20.0, 3.0]),
     ):  # fmt: skip
-        task = task_of(model, settings, SHORT_HIGHWAY, QueryOptions.make(N, 2))
+        task = task_of(model, settings, SHORT_HIGHWAY, Queries.make(N, 2))
         scaled = Fusion(task, FusionSettings(), 0.1).scaled(np.array([2.0, 3.0]))
         np.testing.assert_allclose(scaled, expected)

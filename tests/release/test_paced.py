@@ -258,12 +258,12 @@ def test_the_account_bounds_every_ledger_and_never_decreases(data):
     )
     spans = data.draw(st.sampled_from([(1,), (1, 2)]))
     release = Worlds(crowd(15)).started(asked, 1, spans=spans)
-    n_columns, n_options = release.task.n_channels, release.task.queries.n_options
+    n_columns, n_queries = release.task.n_channels, release.task.queries.n_queries
     generator = np.random.default_rng(data.draw(SEEDS))
     squares = 2.0 if asked.adjacency == "replace" else 1.0
     mu, epsilon = 0.0, 0.0
     for second in np.tile(ROUNDS, 3).tolist():
-        flags = np.isin(np.arange(n_columns), generator.integers(n_options, size=3))
+        flags = np.isin(np.arange(n_columns), generator.integers(n_queries, size=3))
         speed = generator.choice([0.0, 20.0, LIMIT])
         release.release(request(second, flags, predicting(30.0, speed), n_columns=n_columns))
         (spent,), (loss,) = release.spent(ONE, ONE)

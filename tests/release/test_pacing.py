@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dptse_env.release import Group, Paced, PacedSettings, QueryOptions
+from dptse_env.release import Group, Paced, PacedSettings, Queries
 from dptse_env.release.pacing import EventPacing, TripPacing
 from dptse_env.traffic import SHORT_HIGHWAY
 from tests.helpers import UNEVEN
@@ -29,7 +29,7 @@ def make(
 ):  # fmt: skip
     """A pacing of half the road a second, unless another bandwidth is given."""
     road = road.replaced(fixed_sensors=sensors)
-    queries = QueryOptions.make(
+    queries = Queries.make(
         road.geometry.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1
     )
     settings = PacedSettings(pace=PACE, ratio=RATIO, boundary_inputs=boundary)

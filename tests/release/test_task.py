@@ -4,7 +4,7 @@ import numpy as np
 
 from dptse_env.config import resolve
 from dptse_env.parts import make_model, make_task
-from dptse_env.release import Corrected, PrivacySettings, QueryOptions
+from dptse_env.release import Corrected, PrivacySettings, Queries
 from tests.helpers import UNEVEN, MeanRelease, SumRelease
 
 from .worlds import task_of
@@ -32,7 +32,7 @@ def test_channels_are_those_of_the_road_and_then_boundary_cells():
 
 def test_a_channel_is_as_long_as_what_it_covers():
     settings = PrivacySettings("corrected", boundary_inputs="private")
-    options = QueryOptions.make(UNEVEN.geometry.n_mainline, 2)
+    options = Queries.make(UNEVEN.geometry.n_mainline, 2)
     uneven = task_of(Corrected, settings, UNEVEN, options)
     np.testing.assert_array_equal(uneven.channels.length, UNEVEN.road.lengths)
 

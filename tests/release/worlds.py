@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dptse_env.estimators import Estimate
-from dptse_env.release import RELEASE_MODELS, Group, QueryOptions, Request, Task, Traffic
+from dptse_env.release import RELEASE_MODELS, Group, Queries, Request, Task, Traffic
 from dptse_env.release.noise import grid_of
 from dptse_env.release.vehicles import Ledgers
 from dptse_env.traffic import SHORT_HIGHWAY
@@ -70,7 +70,7 @@ class Worlds:
         """A release model of all record columns, of another class than the settings' if given."""
         n = len(self.records)
         settings = dataclasses.replace(settings, boundary_inputs="private")
-        queries = QueryOptions.make(
+        queries = Queries.make(
             self.road.geometry.n_mainline, bandwidth, spans, separate_sensors=len(groups) > 1
         )
         model = kind or RELEASE_MODELS[settings.preset]

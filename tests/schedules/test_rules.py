@@ -7,8 +7,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from dptse_env.config import resolve
 from dptse_env.estimators import Estimate
 from dptse_env.parts import make_interface
-from dptse_env.release import QueryOptions
-from dptse_env.schedules import best_options, make_schedule, option_values
+from dptse_env.release import Queries
+from dptse_env.schedules import best_queries, make_schedule, option_values
 from tests.helpers import SumRelease, make_env
 
 from .playing import begin, make_batch
@@ -195,9 +195,9 @@ def test_the_expected_reduction_is_that_of_independent_updates(privacy, term):
 def test_an_option_is_worth_the_mean_of_its_segments_for_its_cost():
     free = np.zeros(0, dtype=np.int64)
     value = np.array([[1.0, 2.0, 3.0, 0.0]])
-    sums = QueryOptions.make(4, 2, (1, 2), unit="sums")
+    sums = Queries.make(4, 2, (1, 2), unit="sums")
     assert option_values(sums, value, free).tolist() == [[1, 2, 3, 0, 1.5, 2.5, 1.5]]
-    segments = QueryOptions.make(4, 2, (1, 2))
+    segments = Queries.make(4, 2, (1, 2))
     assert option_values(segments, value, free).tolist() == [[1, 2, 3, 0, 0.75, 1.25, 0.75]]
     # A fixed sensor makes a segment worth the least of the others.
     value, sensors = np.array([[4.0, 2.0, 9.0, 9.0]]), np.array([2, 3])
@@ -208,13 +208,13 @@ def test_an_option_is_worth_the_mean_of_its_segments_for_its_cost():
 @pytest.mark.parametrize(
     ("options", "value", "expected"),
     [
-        (QueryOptions.make(6, 2, (3,), unit="sums"), [1, 1, 1, 1, 1, 0.5], [0, 3]),
+        (Queries.make(6, 2, (3,), unit="sums"), [1, 1, 1, 1, 1, 0.5], [0, 3]),
         # None is left apart from the best.
-        (QueryOptions.make(6, 2, (3,), unit="sums"), [0, 1, 1, 1, 0, 0], [0, 1]),
-        (QueryOptions.make(6, 3, (1, 2)), [0, 0, 1, 5, 5, 0], [2, 3, 4]),
+        (Queries.make(6, 2, (3,), unit="sums"), [0, 1, 1, 1, 0, 0], [0, 1]),
+        (Queries.make(6, 3, (1, 2)), [0, 0, 1, 5, 5, 0], [2, 3, 4]),
     ],
 )
 def test_the_best_options_are_apart_while_there_are_such(options, value, expected):
     none, step = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
-    (best,) = best_options(options, np.array([value], dtype=float), none, step)
+    (best,) = best_queries(options, np.array([value], dtype=float), none, step)
     assert options.first[best].tolist() == expected

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dptse_env.release import QueryOptions
+from dptse_env.release import Queries
 from dptse_env.spaces.actions import (
     ACTION_ENCODINGS,
     MaskAction,
@@ -24,7 +24,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 def queries(bandwidth, costs):
     n = len(costs)
-    return QueryOptions(np.arange(n), np.ones(n, dtype=np.int64), np.asarray(costs), n, bandwidth)
+    return Queries(np.arange(n), np.ones(n, dtype=np.int64), np.asarray(costs), n, bandwidth)
 
 
 class Played:

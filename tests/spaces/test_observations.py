@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import Estimate
-from dptse_env.release import Corrected, PrivacySettings, QueryOptions
+from dptse_env.release import Corrected, PrivacySettings, Queries
 from dptse_env.spaces.observations import (
     AGE_CAP,
     ObservationEncoding,
@@ -25,7 +25,7 @@ ROAD = Corridor(
 
 
 def encoding(blocks=("default",), epsilon=0.1, model=Corrected, **changes):
-    settings, queries = PrivacySettings(epsilon=epsilon), QueryOptions.make(N, 2)
+    settings, queries = PrivacySettings(epsilon=epsilon), Queries.make(N, 2)
     task = task_of(model, settings, ROAD, queries)
     return ObservationEncoding(task, blocks, **changes)
 

@@ -113,10 +113,10 @@ class Neighbours(ActionEncoding):
     """``Discrete(n - 1)``: a segment and the next one downstream."""
 
     def make_space(self) -> Any:
-        return spaces.Discrete(self.n_options - 1)
+        return spaces.Discrete(self.n_queries - 1)
 
     def decode(self, episodes: Any, actions: Any, pending: Any) -> Decision:
-        ahead = np.arange(self.n_options) - np.asarray(actions)[:, None]
+        ahead = np.arange(self.n_queries) - np.asarray(actions)[:, None]
         k = len(ahead)
         queried = (ahead == 0) | (ahead == 1)
         return Decision(queried, np.zeros(k, dtype=np.int64), np.ones(k, dtype=bool))

@@ -43,14 +43,14 @@ def test_batches_are_episodes_whose_queries_stay_within_the_bandwidth(name, acti
     keywords = {"privacy": PricedRelease, "action": action, **CONFIGURATIONS[name]}
     lock_step(keywords, 8)
     env = make_env(**EPISODES, **keywords)
-    options = env.unwrapped.config.queries
+    queries = env.unwrapped.config.queries
     env.reset(seed=1)
     env.action_space.seed(2)
     truncated = False
     while not truncated:
         observation, _, _, truncated, info = env.step(env.action_space.sample())
-        assert info["queried"].shape == (options.n_options,)
-        assert info["queried"] @ options.cost <= options.bandwidth
+        assert info["queried"].shape == (queries.n_queries,)
+        assert info["queried"] @ queries.cost <= queries.bandwidth
         assert env.observation_space.contains(observation)
 
 
@@ -61,9 +61,9 @@ def make_process(**keywords):
     return process
 
 
-def query(process, *options):
-    """Query options for a second, by mask; return the observation."""
-    flags = np.isin(np.arange(process.interface.queries.n_options), options)
+def query(process, *queries):
+    """Queries for a second, by mask; return the observation."""
+    flags = np.isin(np.arange(process.interface.queries.n_queries), queries)
     return process.step(ONE, flags[None].astype(np.int8)).observation
 
 
@@ -89,8 +89,8 @@ def test_age_is_of_segments_and_counts_every_query_that_covers_them():
     for _ in range(3):
         query(process)
     ages = []
-    for options in ((1,), (7,), ()):
-        query(process, *options)
+    for queries in ((1,), (7,), ()):
+        query(process, *queries)
         ages.append(process.age[0].tolist())
     assert ages == [[64, 0, 0, 64, 64, 0], [65, 1, 0, 0, 0, 0], [66, 2, 1, 1, 1, 0]]
 
@@ -129,13 +129,13 @@ def test_queries_bring_the_estimate_nearer(estimator, spans):
     assert error(bandwidth=5, **sums) < 0.75 * error(bandwidth=1, **sums)
 
 
-def test_blocks_have_the_size_of_options_and_show_prices_and_the_spent_share():
+def test_blocks_have_the_size_of_queries_and_show_prices_and_the_spent_share():
     process = make_process(query_spans=(2, 3))
-    encoding, n_options = process.interface.observations, 9
-    assert process.interface.actions.space == gym.spaces.MultiBinary(n_options)
+    encoding, n_queries = process.interface.observations, 9
+    assert process.interface.actions.space == gym.spaces.MultiBinary(n_queries)
     sizes = {name: place.stop - place.start for name, place in encoding.slices.items()}
-    of_options = ("released_density", "released_flow", "density_innovation", "queried")
-    assert {sizes[name] for name in (*of_options, "speed_innovation", "last_price")} == {n_options}
+    of_queries = ("released_density", "released_flow", "density_innovation", "queried")
+    assert {sizes[name] for name in (*of_queries, "speed_innovation", "last_price")} == {n_queries}
     assert {sizes[name] for name in ("age", "spent_share")} == {6}
     first = process.observe(ONE)
     assert not encoding.block(first, "last_price").any()
