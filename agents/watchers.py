@@ -22,7 +22,7 @@ class Contributions:
     """Contributions of the vehicles of a batch of episodes, by place and by length of trip.
 
     A contribution is counted once for each second in which a query covers a vehicle. Where queries
-    and fixed sensors are two groups of columns, it is those to queries. Episodes begin at second 0
+    and fixed sensors are two groups of channels, it is those to queries. Episodes begin at second 0
     of their records. A vehicle that still drives at the end of an episode counts with what it has
     done by then.
 
@@ -69,7 +69,7 @@ class Contributions:
         """Count the contributions of one episode: covered places, and who has paid."""
         n, second = self._met.shape[1], slice(rows.start[k], rows.stop[k])
         seen = rows.speed[0, second] >= 0.0
-        vehicle, place = rows.vehicle[second][seen], rows.place[second][seen]
+        vehicle, place = rows.vehicle[second][seen], rows.cell[second][seen]
         self._seconds[k, vehicle[place < n]] += 1
         met = np.append(covered, False)[np.minimum(place, len(covered))]
         vehicle, place = vehicle[met], place[met]

@@ -305,7 +305,7 @@ def _penetration(
     found: Penetration = _typed(path, fields, base)
     whole = found.is_complete or has_vehicles(corridor.source.recordings)
     require(whole, f"{path}.share", "1 on a road of measured fields", found.share)
-    alike = f"1 {_with_model(privacy)}, which knows of no groups of columns"
+    alike = f"1 {_with_model(privacy)}, which knows of no groups of channels"
     is_served = found.is_complete or RELEASE_MODELS.find(privacy.preset).knows_groups
     require(is_served, f"{path}.share", alike, found.share)
     return found
@@ -322,7 +322,7 @@ def _detectors(
     exact = "left out on a road without fixed sensors, and on one of measured fields"
     has_any = n > 0 and has_vehicles(corridor.source.recordings)
     require(has_any or found == Detectors(), path, exact, found)
-    alike = f"left out {_with_model(privacy)}, which knows of no groups of columns"
+    alike = f"left out {_with_model(privacy)}, which knows of no groups of channels"
     is_served = found == Detectors() or RELEASE_MODELS.find(privacy.preset).knows_groups
     require(is_served, path, alike, found)
     return found

@@ -76,7 +76,7 @@ class QueryProcess:
         traffic_index: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
         queried: The queries of each episode's last query, shape (n, G).
         age: Steps since each mainline segment was last observed, shape (n, n_mainline).
-        released: The last releases of the M rows, shape (n, M, 2).
+        released: The last releases of the M channels, shape (n, M, 2).
         pending: State of the action encoding between actions.
         estimate: The present estimates, arrays of shape (n, S).
         error: Their error, arrays of shape (n,).

@@ -165,8 +165,8 @@ MUTANTS = (
     # --- one vehicle --------------------------------------------------------------------------
     Mutant(
         "two vehicles share a ledger", 4, "release/vehicles.py",
-        "s, v = rows.place[row], rows.vehicle[row]",
-        "s, v = rows.place[row], rows.vehicle[row] // 2",
+        "s, v = rows.cell[row], rows.vehicle[row]",
+        "s, v = rows.cell[row], rows.vehicle[row] // 2",
         "test_guarantee.py",
     ),
     Mutant(
@@ -272,8 +272,8 @@ MUTANTS = (
     ),
     Mutant(
         "a ledger goes with the segment", 10, "release/vehicles.py",
-        "s, v = rows.place[row], rows.vehicle[row]",
-        "s, v = rows.place[row], (rows.vehicle[row] + rows.place[row]) % paid.shape[2]",
+        "s, v = rows.cell[row], rows.vehicle[row]",
+        "s, v = rows.cell[row], (rows.vehicle[row] + rows.cell[row]) % paid.shape[2]",
         "test_guarantee.py",
     ),
     Mutant(

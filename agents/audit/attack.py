@@ -64,7 +64,7 @@ class Overheard(ReleaseModel):
         model: The release model.
         last: Its last release.
         means: What either world would have released without noise, shape (2, k, C, 2).
-        heard: Score and squared distance of each column of it, shape (2, k, C).
+        heard: Score and squared distance of each channel of it, shape (2, k, C).
         score: Log-likelihood ratio of world 1 of each run's transcript so far, shape (k,).
         square: Squared distance between the worlds' sums so far, in units of the noise, (k,).
     """

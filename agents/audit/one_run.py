@@ -51,7 +51,7 @@ class Design:
         slot: Length of a slot [s].
         canaries: Trajectory of each of the n canaries by its coin.
         plan: Queries of each step, shape (horizon, G).
-        owner: The canary that a column of a release may tell of, by step, shape (horizon, C); n
+        owner: The canary that a channel may tell of, by step, shape (horizon, C); n
             where there is none.
     """
 
@@ -71,7 +71,7 @@ class Design:
         return [pair[coin] for pair, coin in zip(self.canaries, coins.tolist(), strict=True)]
 
     def by_canary(self, heard: FloatArray) -> FloatArray:
-        """Return the sums for each canary, (n,), of what columns tell, shape (horizon, C)."""
+        """Return the sums for each canary, (n,), of what channels tell, shape (horizon, C)."""
         sums = np.zeros(self.n + 1)
         np.add.at(sums, self.owner, heard)
         return sums[: self.n]

@@ -110,7 +110,7 @@ class Planner:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Those of `KINDS` that go with the adjacency and the groups of columns."""
+        """Those of `KINDS` that go with the adjacency and the groups of channels."""
         kinds = KINDS if self._is_whole else ("worst-case",)
         alone = () if self.replaces else ("opposite", "replaced")
         return tuple(kind for kind in kinds if kind not in alone)
@@ -202,7 +202,7 @@ class Planner:
         """Return the segments on which a made-up vehicle stands, the best first.
 
         Those without a sensor and with few others come first: there, a vehicle moves the mean
-        speed most. With two groups of columns sensors come first, where both see the vehicle.
+        speed most. With two groups of channels sensors come first, where both see the vehicle.
         """
         corridor = self.config.corridor
         load = record.counts[:, : corridor.geometry.n_mainline].sum(axis=0)

@@ -32,7 +32,7 @@ BATCH, ROUNDS = 2, 2
 FEWEST = 10.0
 """Least sum of squares by which a correlation is divided: that of some ten numbers."""
 
-AXES, QUANTITIES = ("second", "column", "quantity"), ("density", "speed")
+AXES, QUANTITIES = ("second", "channel", "quantity"), ("density", "speed")
 
 
 @dataclass(frozen=True)
@@ -98,9 +98,9 @@ def residuals_of(
 def examine(residuals: FloatArray) -> NoiseTest:
     """Test residuals over sigma, shape (n, C, 2), for independent noise that is no smaller.
 
-    Sums of squares by second, column and quantity follow a chi-square law, and no size is exceeded
+    Sums of squares by second, channel and quantity follow a chi-square law, and no size is exceeded
     less often than by a normal number. Products with later numbers are tested for each lag [s], for
-    each pair of columns and quantities, and for all pairs as far apart together: given the earlier
+    each pair of channels and quantities, and for all pairs as far apart together: given the earlier
     numbers y, the sum of x y over the root of that of y^2 is a standard normal number. Bonferroni's
     correction is for all tests.
     """
@@ -114,7 +114,7 @@ def examine(residuals: FloatArray) -> NoiseTest:
 
 
 def _squares(known: FloatArray, seen: BoolArray) -> Iterator[tuple[float, str]]:
-    """Yield the probability of so little noise in any second, column and quantity."""
+    """Yield the probability of so little noise in any second, channel and quantity."""
     for axis, name in enumerate(AXES):
         others = tuple(each for each in range(3) if each != axis)
         n, squares = seen.sum(axis=others), np.sum(known**2, axis=others)
@@ -129,31 +129,31 @@ def _squares(known: FloatArray, seen: BoolArray) -> Iterator[tuple[float, str]]:
 
 
 def _products(known: FloatArray, seen: BoolArray) -> Iterator[tuple[float, str]]:
-    """Yield the probability of so large a correlation of any two channels, and of all as apart.
+    """Yield the probability of so large a correlation of any two series, and of all as apart.
 
-    A channel is a quantity of a column.
+    A series is a quantity of a channel.
     """
-    n, n_columns = len(known), known.shape[1]
+    n, n_channels = len(known), known.shape[1]
     x, seen = known.reshape(n, -1), seen.reshape(n, -1)
     # More noise than stated correlates no more.
     scale = np.sqrt(np.sum(x**2, axis=0) / np.maximum(seen.sum(axis=0), 1))
     x = x / np.where(scale > 0.0, scale, 1.0)
     size = next_fast_len(2 * n)
     values, squares, flags = (rfft(each, size, axis=0) for each in (x, x**2, seen.astype(float)))
-    # How many columns and quantities two channels are apart, as one number.
-    place = 3 * np.repeat(np.arange(n_columns), 2) + np.tile([0, 1], n_columns)
-    apart, pairs = np.zeros((2, n, 6 * n_columns)), []
+    # How many channels and quantities two series are apart, as one number.
+    place = 3 * np.repeat(np.arange(n_channels), 2) + np.tile([0, 1], n_channels)
+    apart, pairs = np.zeros((2, n, 6 * n_channels)), []
     for i in range(x.shape[1]):
         terms = (values[:, [i]], values), (squares[:, [i]], flags)
         both = np.array([irfft(y.conj() * later, size, axis=0)[:n] for y, later in terms])
         both[:, 0, : i + 1] = 0.0
-        apart[:, :, place - place[i] + 3 * n_columns] += both
+        apart[:, :, place - place[i] + 3 * n_channels] += both
         most = _largest(*both)
-        names = (f"the {QUANTITIES[each % 2]} of column {each // 2}" for each in (i, most.channel))
+        names = (f"the {QUANTITIES[each % 2]} of channel {each // 2}" for each in (i, most.series))
         pairs.append((most, " and ".join(names)))
     together = _largest(*apart)
-    columns, quantities = divmod(together.channel - 3 * n_columns + 1, 3)
-    words = f"every number and that {columns} columns and {quantities - 1} quantities further"
+    channels, quantities = divmod(together.series - 3 * n_channels + 1, 3)
+    words = f"every number and that {channels} channels and {quantities - 1} quantities further"
     most, pair = max(pairs)
     most = most._replace(n_tests=sum(each.n_tests for each, _ in pairs))
     for found, between in ((most, pair), (together, words)):
@@ -167,16 +167,16 @@ class _Largest(NamedTuple):
     z: float
     n_tests: int
     lag: int
-    channel: int
+    series: int
     correlation: float
 
 
 def _largest(products: FloatArray, squares: FloatArray) -> _Largest:
-    """Return the largest correlation, of sums over lags and channels."""
+    """Return the largest correlation, of sums over lags and series."""
     tested = squares > FEWEST
     squares = np.where(tested, squares, np.inf)
     z = np.abs(products) / np.sqrt(squares)
-    lag, channel = np.unravel_index(np.argmax(z), z.shape)
-    # Channels are standardised where they are seen, which is not only here.
-    correlation = float(np.clip(products[lag, channel] / squares[lag, channel], -1.0, 1.0))
-    return _Largest(float(z.max()), int(tested.sum()), int(lag), int(channel), correlation)
+    lag, series = np.unravel_index(np.argmax(z), z.shape)
+    # Series are standardised where they are seen, which is not only here.
+    correlation = float(np.clip(products[lag, series] / squares[lag, series], -1.0, 1.0))
+    return _Largest(float(z.max()), int(tested.sum()), int(lag), int(series), correlation)

@@ -56,8 +56,8 @@ class Measurement(NamedTuple):
     released; estimators read the first M.
 
     Attributes:
-        observed: Columns that were queried or are always observed, and answered, shape (k, C).
-        values: Average density [veh/km] of a column's segments and their average centred flow
+        observed: Channels that were queried or are always observed, and answered, shape (k, C).
+        values: Average density [veh/km] of a channel's segments and their average centred flow
             [veh/h], or their mean speed [km/h]: shape (k, C, 2); ignored where not observed.
         sigma: Standard deviations of their noise, in the same units, shape (k, C, 2).
         centre: Speeds [km/h] that the flows are centred on, of the segments, and of the boundary
@@ -115,7 +115,7 @@ class Measurement(NamedTuple):
         return Measurement(observed[episodes], values[episodes], sigma[episodes], centre[episodes])
 
     def on_road(self, n_rows: int, n_segments: int) -> Measurement:
-        """Return the columns of the road alone, without those of boundary segments."""
+        """Return the channels of the road alone, without those of boundary segments."""
         if self.observed.shape[1] == n_rows and self.centre.shape[1] == n_segments:
             return self
         return Measurement(

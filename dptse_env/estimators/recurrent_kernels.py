@@ -1,11 +1,11 @@
 """The step of a recurrent network, compiled, for blocks of episodes: its inputs and its weights.
 
 A release is read as by a Kalman filter to which the errors of different cells, and of density and
-speed, are independent. A row m of a measurement averages over its cells two numbers:
+speed, are independent. A channel m of a measurement averages over its cells two numbers:
 densities rho, and y = rho (v - centre) where flows are released, or y = v where speeds are. The
-prediction of a cell has the variances P_rho, P_v and hence P_y. With the variance V_m of the row's
-innovation e_m, the measured less the predicted average, noise included, a cell's gain and
-correction are, over the rows that cover it,
+prediction of a cell has the variances P_rho, P_v and hence P_y. With the variance V_m of a
+channel's innovation e_m, the measured less the predicted average, noise included, a cell's gain and
+correction are, over the channels that cover it,
 
     K_ms = P_s / (span_m V_m)      d_s = sum_m K_ms e_m
 

@@ -56,8 +56,8 @@ POLISHES = 10
 class Problem:
     """The equations of a filter: x' = f(x, u) + N(0, Q), z = h(x) + N(0, R), normalised.
 
-    States x have the shape `(k, n_x)`, the means of distributions `(n_x,)`, the m observed rows of
-    a measurement 2 m numbers.
+    States x have the shape `(k, n_x)`, the means of distributions `(n_x,)`. The m observed channels
+    of a measurement have 2 m numbers.
     """
 
     def __init__(self, model: ARZModel, settings: EstimatorSettings) -> None:
@@ -155,7 +155,7 @@ class EpisodeFilter(ABC):
 
     @abstractmethod
     def assimilate(self, seen: Measurement) -> FloatArray:
-        """Update by a measurement of any rows; return their normalised innovations `(2 m,)`."""
+        """Update by a measurement of any channels; return their normalised innovations `(2 m,)`."""
 
     def is_sound(self) -> bool:
         """Return whether mean and variances are valid and no correlation is above one."""

@@ -46,7 +46,7 @@ class BoundaryModel(ABC):
         """Begin new episodes, shape (k,)."""
 
     def update(self, episodes: IntArray, measured: Measurement) -> None:  # noqa: B027 (nothing)
-        """Take the release of a second, whose last R columns are the boundary segments."""
+        """Take the release of a second, whose last R channels are the boundary segments."""
 
 
 class TrueBoundary(BoundaryModel):

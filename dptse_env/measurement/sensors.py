@@ -1,4 +1,4 @@
-"""Connected vehicles and fixed sensors: their groups of columns, and the errors of detectors."""
+"""Connected vehicles and fixed sensors: their groups of channels, and the errors of detectors."""
 
 import math
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ class Detectors:
 def make_groups(
     penetration: Penetration, detectors: Detectors, corridor: Corridor, *, private_boundary: bool
 ) -> tuple[Group, ...]:
-    """Return the groups of columns.
+    """Return the groups of channels.
 
     A query sums over the connected vehicles of its segments, a fixed sensor over all vehicles of
     its segment. They share no ledger, since a fixed sensor cannot tell which vehicle is which: each
@@ -94,7 +94,7 @@ class DetectorErrors:
 
     def __init__(self, task: Task, detectors: Detectors) -> None:
         """Prepare for episodes."""
-        self._detectors, self._columns = detectors, task.sensors
+        self._detectors, self._channels = detectors, task.sensors
         self._length, self._releases_flow = task.channels.length[task.sensors], task.releases_flow
         self._factor = np.broadcast_to(np.array(detectors.factor, np.float64), task.sensors.shape)
         self._streams: dict[int, np.random.Generator] = {}
@@ -107,24 +107,24 @@ class DetectorErrors:
         """Return a request without the sensors that do not answer in this second."""
         silent = self._drawn(request.episodes, "random") < self._detectors.dropout
         observed: BoolArray = request.observed.copy()
-        observed[:, self._columns] &= ~silent
+        observed[:, self._channels] &= ~silent
         return request._replace(observed=observed)
 
     def added(self, episodes: IntArray, released: Measurement) -> Measurement:
         """Return a release with the errors of this second; mean speeds are not affected."""
         values, sigma = released.values.copy(), released.sigma.copy()
-        detectors, columns = self._detectors, self._columns
-        density = values[:, columns, 0] * self._factor
+        detectors, channels = self._detectors, self._channels
+        density = values[:, channels, 0] * self._factor
         error = detectors.absolute / self._length + detectors.relative * np.maximum(
             density, 0.0
         )  # [veh/km]
-        values[:, columns, 0] = density + error * self._drawn(episodes, "standard_normal")
-        sigma[:, columns, 0] = np.hypot(sigma[:, columns, 0], error)
+        values[:, channels, 0] = density + error * self._drawn(episodes, "standard_normal")
+        sigma[:, channels, 0] = np.hypot(sigma[:, channels, 0], error)
         if self._releases_flow:
-            values[:, columns, 1] *= self._factor
+            values[:, channels, 1] *= self._factor
         return released._replace(values=values, sigma=sigma)
 
     def _drawn(self, episodes: IntArray, kind: str) -> FloatArray:
         """Return a draw for each sensor of k episodes, shape (k, F)."""
         rows = [self._streams[episode] for episode in episodes.tolist()]
-        return np.stack([getattr(row, kind)(self._columns.size) for row in rows])
+        return np.stack([getattr(row, kind)(self._channels.size) for row in rows])

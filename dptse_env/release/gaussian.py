@@ -95,7 +95,7 @@ class GaussianRelease(ReleaseModel):
 
     @abstractmethod
     def _sensitivity(self, group: int) -> Sensitivity:
-        """Return the sensitivities of both released quantities in a group of columns."""
+        """Return the sensitivities of both released quantities in a group of channels."""
 
     @abstractmethod
     def _noise_std(self, group: int) -> tuple[float, ...]:
@@ -105,9 +105,9 @@ class GaussianRelease(ReleaseModel):
     def true_values(self, request: Request) -> FloatArray:
         """Return what noise is added to, shape (k, C, 2).
 
-        Sums over vehicles where flows are released, else means times the length of a column over
-        that of the shortest segment. Where contributions are bounded, those of the observed columns
-        are charged.
+        Sums over vehicles where flows are released, else means times the length of a channel over
+        that of the shortest segment. Where contributions are bounded, those of the observed
+        channels are charged.
         """
 
     @property
@@ -200,7 +200,7 @@ def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:
 class Paper(GaussianRelease):
     """True density and mean speed of all vehicles, with the noise as printed in the paper.
 
-    Where a group of columns does not see all vehicles, of those that it sees.
+    Where a group of channels does not see all vehicles, of those that it sees.
     """
 
     void_reasons: ClassVar[tuple[str, ...]] = (
@@ -239,9 +239,9 @@ class Paper(GaussianRelease):
         return values[:, self._places] * self.unit[:, None]
 
     def _means(self, request: Request) -> FloatArray:
-        """Return `true_values` of the vehicles that each column sees.
+        """Return `true_values` of the vehicles that each channel sees.
 
-        Without any of them the speed limit is the mean; unobserved columns hold these, too.
+        Without any of them the speed limit is the mean; unobserved channels hold these, too.
         """
         task = self.task
         sums = self.sums(request, self._zero)
@@ -310,7 +310,7 @@ class Capped(GaussianRelease):
     The guarantee holds for any query policy. The centred flow [veh/h] is the sum of v - v_0 over
     the vehicles that count, per length, with v clipped to [0, 2 v_0]: it changes by at most v_0 / l
     when a vehicle comes or goes. ``docs/privacy/proof.md`` has the proof. A vehicle's ledger has a
-    budget of C contributions at a price of 1 each, in each group of columns.
+    budget of C contributions at a price of 1 each, in each group of channels.
     """
 
     settings_type: ClassVar[type[PrivacySettings]] = CappedSettings
@@ -360,7 +360,7 @@ class Capped(GaussianRelease):
         }  # fmt: skip
 
     def true_values(self, request: Request) -> FloatArray:
-        """See `GaussianRelease.true_values`; unobserved columns hold zeros."""
+        """See `GaussianRelease.true_values`; unobserved channels hold zeros."""
         return self.sums(request, self._centre)
 
     def budgets_spent(self, episodes: IntArray) -> FloatArray:
@@ -374,7 +374,7 @@ class Capped(GaussianRelease):
         """Return each vehicle's contributions, and the epsilon that it has spent.
 
         Lists, since records differ in their number of vehicles and Gymnasium stacks arrays of equal
-        shape only. ``exposures`` are contributions to queries; those to a second group of columns
+        shape only. ``exposures`` are contributions to queries; those to a second group of channels
         are ``sensor_exposures``.
         """
         counted = self.ledgers.of(episodes, self.traffic.n_vehicles[traffic])

@@ -49,7 +49,7 @@ class ReleaseModel(ABC):
     has_prices: ClassVar[bool] = False
     """True where queries have prices, which `public` gives."""
     knows_groups: ClassVar[bool] = False
-    """True where each column shows what its group sees, and spends its group's part of the
+    """True where each channel shows what its group sees, and spends its group's part of the
     budget."""
     takes_noise: ClassVar[bool] = False
     """True where noise is a `dptse_env.release.noise.Noise`, which `give_noise` sets for trainings
@@ -88,12 +88,12 @@ class ReleaseModel(ABC):
     def release(self, request: Request) -> Measurement:
         """Release one second of some episodes; called once for every second.
 
-        Noise should be drawn for all columns, observed or not, so that different policies with the
+        Noise should be drawn for all channels, observed or not, so that different policies with the
         same seed have common random numbers.
         """
 
     def measurement(self, request: Request, values: FloatArray, sigma: FloatArray) -> Measurement:
-        """Return a release in which all columns answer, around the `centre`.
+        """Return a release in which all channels answer, around the `centre`.
 
         Args:
             request: The request.
@@ -133,7 +133,7 @@ class ReleaseModel(ABC):
         )
 
     def public(self, episodes: IntArray) -> Infos:
-        """Return further public numbers for ``info``, rows of k episodes; by default none.
+        """Return further public numbers for ``info``, of k episodes; by default none.
 
         Where queries have prices, ``prices`` (k, G) and ``spent_share`` (k, n_mainline) are among
         them, as `dptse_env.spaces.observations.PublicState` describes them.
@@ -141,7 +141,7 @@ class ReleaseModel(ABC):
         return {}
 
     def private(self, episodes: IntArray, traffic: IntArray) -> Infos:
-        """Return private data for ``info["truth"]`` alone, rows of k episodes; by default none."""
+        """Return private data for ``info["truth"]`` alone, of k episodes; by default none."""
         return {}
 
     def budgets_spent(self, episodes: IntArray) -> FloatArray:
@@ -177,12 +177,12 @@ def check_released(release: ReleaseModel, released: Any, request: Request) -> No
     path = f"privacy.preset {name_of_class(release)}.release()"
     if not isinstance(released, Measurement):
         raise ValueError(f"{path} must return a Measurement, got {type(released).__name__}")
-    columns, places = request.observed.shape, (len(request.observed), release.task.n_cells)
+    channels, cells = request.observed.shape, (len(request.observed), release.task.n_cells)
     for name, array, kind, shape in (
-        ("observed", released.observed, "b", columns),
-        ("values", released.values, "f", (*columns, 2)),
-        ("sigma", released.sigma, "f", (*columns, 2)),
-        ("centre", released.centre, "f", places),
+        ("observed", released.observed, "b", channels),
+        ("values", released.values, "f", (*channels, 2)),
+        ("sigma", released.sigma, "f", (*channels, 2)),
+        ("centre", released.centre, "f", cells),
     ):
         found = np.asarray(array)
         if found.shape != shape or found.dtype.kind != kind:
@@ -191,7 +191,7 @@ def check_released(release: ReleaseModel, released: Any, request: Request) -> No
                 f"{found.shape}"
             )
     if (released.observed & ~request.observed).any():
-        raise ValueError(f"{path} must not say that a column was observed that was not asked for")
+        raise ValueError(f"{path} must not say that a channel was observed that was not asked for")
     if not np.isfinite(released.values[released.observed]).all():
         raise ValueError(f"{path} must return finite values of observed segments")
     if not (np.isfinite(released.sigma) & (released.sigma >= 0.0)).all():

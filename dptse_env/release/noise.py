@@ -124,9 +124,9 @@ def _beyond(scale: float, border: float) -> mpmath.mpf:
 
 
 class Noise:
-    """Independent normal noise for every column and step of n episodes, with a stream for each.
+    """Independent normal noise for every channel and step of n episodes, with a stream for each.
 
-    Noise is drawn for all columns of all groups at every step, observed or not: different policies
+    Noise is drawn for all channels of all groups at every step, observed or not: different policies
     on the same streams have common random numbers, and an episode's noise depends neither on its
     batch nor on the other episodes.
 
@@ -137,7 +137,7 @@ class Noise:
     __copy__ = copy.deepcopy  # two that share a block would not know which step is unused
 
     def __init__(
-        self, n_episodes: int, n_columns: int, source: NoiseSource = "seeded", scale: float = 1.0
+        self, n_episodes: int, n_channels: int, source: NoiseSource = "seeded", scale: float = 1.0
     ) -> None:
         """Prepare streams; each episode needs a `reset` before its first step.
 
@@ -145,7 +145,7 @@ class Noise:
         """
         self._is_secure, self._scale = source == "secure", scale
         self._generators: list[np.random.Generator | None] = [None] * n_episodes
-        self._bits: Bits = np.zeros((n_episodes, BLOCK, n_columns, 2), dtype=np.uint64)
+        self._bits: Bits = np.zeros((n_episodes, BLOCK, n_channels, 2), dtype=np.uint64)
         self._normal = np.zeros(self._bits.shape)
         # Next unused step of each block. An episode that was never reset has a used-up block, so
         # that it cannot be released without noise.
@@ -156,8 +156,8 @@ class Noise:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle has: of secure noise, that of no episode."""
-        n_episodes, _, n_columns, _ = self._bits.shape
-        made = Noise(n_episodes, n_columns, "secure", self._scale) if self._is_secure else self
+        n_episodes, _, n_channels, _ = self._bits.shape
+        made = Noise(n_episodes, n_channels, "secure", self._scale) if self._is_secure else self
         return vars(made)
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:

@@ -86,7 +86,7 @@ class Paced(ReleaseModel):
 
     A vehicle on a queried segment pays for its own deviation from the speed that the estimator
     predicts there, as in `dptse_env.release.vehicles`; prices are those of a pacing
-    (`dptse_env.release.pacing`). With mu the parameter of the guarantee of a group of columns, a
+    (`dptse_env.release.pacing`). With mu the parameter of the guarantee of a group of channels, a
     vehicle has a budget of mu^2 / 2 there against its replacement by another, and of mu^2 against
     being added or removed; the mu^2 of the groups add up to that of all releases. The guarantee
     holds for any query policy, any estimator and any pacing; ``docs/privacy/proof.md`` proves it.
@@ -275,7 +275,7 @@ class Paced(ReleaseModel):
 
         The first two are lists, since records differ in their number of vehicles and Gymnasium
         stacks arrays of equal shape only. ``ledgers`` are those of the queries; those of a second
-        group of columns are ``sensor_ledgers``.
+        group of channels are ``sensor_ledgers``.
         """
         paid = self.ledgers.of(episodes, self.traffic.n_vehicles[traffic])
         infos: Infos = {

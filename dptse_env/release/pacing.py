@@ -2,7 +2,7 @@
 
 A price a buys noise of variance 1 / a on the count of a query, and every vehicle that is counted
 pays for it. Pacing should make a vehicle's budget last for its trip. It decides how accurate the
-releases are, never whether the guarantee holds. Each group of columns is paced by itself.
+releases are, never whether the guarantee holds. Each group of channels is paced by itself.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Pacing(ABC):
 
     Attributes:
         task: What is measured.
-        budget: Budget of a vehicle in each group of columns, shape (groups,).
+        budget: Budget of a vehicle in each group of channels, shape (groups,).
     """
 
     def __init__(self, task: Task, budget: FloatArray) -> None:
@@ -56,13 +56,13 @@ class Pacing(ABC):
     def prices(
         self, episodes: IntArray, observed: BoolArray, density: FloatArray, speed: FloatArray
     ) -> FloatArray:
-        """Return the price [1/veh^2] of every column, above zero, shape (k, C).
+        """Return the price [1/veh^2] of every channel, above zero, shape (k, C).
 
         It is called once for every second, before its release.
 
         Args:
             episodes: Distinct episodes of the batch, shape (k,).
-            observed: Columns that are observed, shape (k, C).
+            observed: Channels that are observed, shape (k, C).
             density: Predicted densities [veh/km], shape (k, S).
             speed: Predicted speeds [km/h], shape (k, S).
         """

@@ -1,11 +1,11 @@
 """The true traffic in memory, and what vehicles contribute to the sums of a release.
 
-A vehicle on an observed column contributes (1, d) to its sums, with d its speed less the centre of
-its place, clipped to [-D, D] and rounded to the grid of the column's noise, and pays
-``a (1 + r d^2 / D^2)`` for it, with the price a of the column and the ratio r. Sums of integers are
-exact in any order, so that other vehicles cancel exactly between two records.
+A vehicle on an observed channel contributes (1, d) to its sums, with d its speed less the centre of
+its cell, clipped to [-D, D] and rounded to the grid of the channel's noise, and pays
+``a (1 + r d^2 / D^2)`` for it, with the price a of the channel and the ratio r. Sums of integers
+are exact in any order, so that other vehicles cancel exactly between two records.
 
-A vehicle has a ledger for each group of columns, and contributes if that covers the charge;
+A vehicle has a ledger for each group of channels, and contributes if that covers the charge;
 otherwise it neither contributes nor pays. Whether it does depends on its own trip and on public
 numbers, never on other vehicles: removing one from a record does not change the contributions of
 the others. A price of 1, a ratio of 0 and a budget of C is a cap: a vehicle counts in its first C
@@ -42,15 +42,15 @@ class VehicleRows(NamedTuple):
         start: First row of each episode, shape (k,).
         stop: The row after its last, shape (k,).
         vehicle: Index of a row's vehicle in its record, shape (rows,).
-        place: Column of the record that it is on, shape (rows,).
-        speed: Speed that it reports to each group of columns [km/h], shape (groups, rows); negative
-            where the group does not see it.
+        cell: Cell that it is on, shape (rows,).
+        speed: Speed that it reports to each group of channels [km/h], shape (groups, rows);
+            negative where the group does not see it.
     """
 
     start: IntArray
     stop: IntArray
     vehicle: NDArray[np.int32]
-    place: NDArray[np.int16]
+    cell: NDArray[np.int16]
     speed: NDArray[np.float32]
 
 
@@ -65,8 +65,8 @@ class Traffic:
         corridor: The road.
         seeds: The traffic seeds.
         library: Source of the records.
-        populations: Vehicles that each group of columns sees, None for all; none where vehicles are
-            not read.
+        populations: Vehicles that each group of channels sees, None for all; none where vehicles
+            are not read.
         n_vehicles: Vehicles of each record, shape (n_seeds,); 0 where vehicles are not read.
     """
 
@@ -89,7 +89,7 @@ class Traffic:
             (len(seeds), corridor.conditions.duration + 2), dtype=np.int64
         )
         self._vehicle: NDArray[np.int32] = np.empty(0, dtype=np.int32)
-        self._place: NDArray[np.int16] = np.empty(0, dtype=np.int16)
+        self._cell: NDArray[np.int16] = np.empty(0, dtype=np.int16)
         self._speed: NDArray[np.float32] = np.empty((len(self.populations), 0), dtype=np.float32)
         self._n_rows = 0
 
@@ -117,16 +117,16 @@ class Traffic:
         return self.library.get(self.corridor, self.seeds[index])
 
     def aggregates(
-        self, indices: IntArray, times: IntArray, n_places: int | None = None
+        self, indices: IntArray, times: IntArray, n_cells: int | None = None
     ) -> FloatArray:
         """Return density [veh/km] and mean speed [km/h] of every segment, shape (k, S, 2).
 
         Args:
             indices: Indices of loaded traffic seeds, shape (k,).
             times: Seconds of their records, shape (k,).
-            n_places: Number of record columns; None for the S segments.
+            n_cells: Number of cells; None for the S segments.
         """
-        rows: FloatArray = self._table[indices, times, : n_places or self.corridor.road.n_segments]
+        rows: FloatArray = self._table[indices, times, : n_cells or self.corridor.road.n_segments]
         return rows
 
     def complete(self, index: int) -> FloatArray:
@@ -141,7 +141,7 @@ class Traffic:
         """Return the vehicles of a second of k episodes; arguments are as in `aggregates`."""
         at = indices * self._start.shape[1] + times
         start, stop = self._start.take(at), self._start.take(at + 1)  # quicker than two indices
-        return VehicleRows(start, stop, self._vehicle, self._place, self._speed)
+        return VehicleRows(start, stop, self._vehicle, self._cell, self._speed)
 
     def _append(self, index: int, record: Record) -> None:
         """Append the vehicles of a record, with what each group sees of them."""
@@ -149,10 +149,10 @@ class Traffic:
         end = self._n_rows + record.n_rows
         if end > self._vehicle.size:
             size = max(end, int(GROWTH * self._vehicle.size))
-            self._vehicle, self._place = _longer(self._vehicle, size), _longer(self._place, size)
+            self._vehicle, self._cell = _longer(self._vehicle, size), _longer(self._cell, size)
             self._speed = _longer(self._speed, size)
         rows = slice(self._n_rows, end)
-        self._vehicle[rows], self._place[rows] = record.vehicle, record.segment
+        self._vehicle[rows], self._cell[rows] = record.vehicle, record.segment
         for group, population in enumerate(self.populations):
             self._speed[group, rows] = (
                 record.speed if population is None else population.speeds(self.seeds[index], record)
@@ -186,7 +186,7 @@ class Terms(NamedTuple):
 
 
 class Ledgers:
-    """Ledgers of the vehicles of each episode: what each has paid in each group of columns.
+    """Ledgers of the vehicles of each episode: what each has paid in each group of channels.
 
     Attributes:
         terms: Budgets, and what is charged.
@@ -218,14 +218,14 @@ class Ledgers:
         centre: FloatArray,
         sigma: FloatArray,
     ) -> tuple[FloatArray, IntArray]:
-        """Sum the contributions of a second to the observed columns, and charge the vehicles.
+        """Sum the contributions of a second to the observed channels, and charge the vehicles.
 
         Args:
             episodes: Shape (k,).
-            observed: Columns that are observed, shape (k, C).
+            observed: Channels that are observed, shape (k, C).
             rows: The vehicles of the second.
-            prices: Price a of each column, shape (k, C).
-            centre: Centre at each place [km/h], shape (k, S + R).
+            prices: Price a of each channel, shape (k, C).
+            centre: Centre at each cell [km/h], shape (k, S + R).
             sigma: Standard deviations of the noise of both sums, shape (k, C, 2).
 
         Returns:
@@ -254,18 +254,18 @@ def _collect(
 ) -> tuple[FloatArray, IntArray]:
     channels, terms = bundle.parts
     first, span, clip = channels.first, channels.span, terms.clip
-    n_columns, n_places = first.size, centre.shape[1]
-    sums = np.empty((episodes.size, n_columns, 2))
+    n_channels, n_cells = first.size, centre.shape[1]
+    sums = np.empty((episodes.size, n_channels, 2))
     refused = np.zeros((episodes.size, terms.budget.size), dtype=np.int64)
-    n_covering = np.empty(n_places, dtype=np.int64)
-    covering = np.empty((n_places, n_columns), dtype=np.int64)
-    counts, deviations = np.empty(n_columns, dtype=np.int64), np.empty(n_columns, dtype=np.int64)
-    grid, most = np.empty(n_columns), np.empty(n_columns)
+    n_covering = np.empty(n_cells, dtype=np.int64)
+    covering = np.empty((n_cells, n_channels), dtype=np.int64)
+    counts, deviations = np.empty(n_channels, dtype=np.int64), np.empty(n_channels, dtype=np.int64)
+    grid, most = np.empty(n_channels), np.empty(n_channels)
     for k in range(episodes.size):
         n_covering[:] = 0
         counts[:] = 0
         deviations[:] = 0
-        for c in range(n_columns):
+        for c in range(n_channels):
             grid[c] = grid_of(sigma[k, c, 1])
             most[c] = np.floor(clip / grid[c])
             if observed[k, c]:
@@ -274,9 +274,9 @@ def _collect(
                     n_covering[s] += 1
         ledgers = paid[episodes[k]]
         for row in range(rows.start[k], rows.stop[k]):
-            s, v = rows.place[row], rows.vehicle[row]
-            # A vehicle pays for every query that covers it, in the order of the columns.
-            for i in range(n_covering[s] if s < n_places else 0):
+            s, v = rows.cell[row], rows.vehicle[row]
+            # A vehicle pays for every query that covers it, in the order of the channels.
+            for i in range(n_covering[s] if s < n_cells else 0):
                 c = covering[s, i]
                 g = channels.group[c]
                 reported = rows.speed[g, row]
@@ -292,7 +292,7 @@ def _collect(
                     deviations[c] += np.int64(steps)
                 else:
                     refused[k, g] += 1
-        for c in range(n_columns):
+        for c in range(n_channels):
             sums[k, c, 0] = counts[c]
             sums[k, c, 1] = deviations[c] * grid[c]
     return sums, refused

@@ -1,4 +1,4 @@
-"""Connected vehicles and fixed sensors: groups of columns, and the errors of detectors."""
+"""Connected vehicles and fixed sensors: groups of channels, and the errors of detectors."""
 
 import dataclasses
 import math
@@ -72,7 +72,7 @@ def true_counts(process, asked, *segments):
     return tuple(each.counts[int(asked.times[0]), list(segments)] for each in (record, some))
 
 
-# --- groups of columns -------------------------------------------------------------------------
+# --- groups of channels -------------------------------------------------------------------------
 
 
 def test_groups_are_queries_and_sensors_with_their_parts_of_the_budget():

@@ -42,7 +42,7 @@ def test_aggregates_and_vehicles_are_those_of_the_second_and_groups_see_some_of_
     rows = traffic.vehicles(*second)
     seen = slice(rows.start[0], rows.stop[0])
     np.testing.assert_array_equal(rows.vehicle[seen], record.vehicle[own])
-    np.testing.assert_array_equal(rows.place[seen], record.segment[own])
+    np.testing.assert_array_equal(rows.cell[seen], record.segment[own])
     np.testing.assert_array_equal(rows.speed[0, seen], record.speed[own])
     np.testing.assert_array_equal(rows.speed[1, seen], some.speeds(7, record)[own])
 

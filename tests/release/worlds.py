@@ -188,7 +188,7 @@ class PlainLedgers(Ledgers):
         refused = np.zeros((len(observed), self.terms.budget.size), dtype=np.int64)
         for k, episode in enumerate(episodes.tolist()):
             for row in range(rows.start[k], rows.stop[k]):
-                place, vehicle = int(rows.place[row]), int(rows.vehicle[row])
+                place, vehicle = int(rows.cell[row]), int(rows.vehicle[row])
                 if place >= centre.shape[1]:
                     continue
                 covers = observed[k] & (first <= place) & (place < first + span)

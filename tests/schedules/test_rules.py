@@ -8,7 +8,7 @@ from dptse_env.config import resolve
 from dptse_env.estimators import Estimate
 from dptse_env.parts import make_interface
 from dptse_env.release import Queries
-from dptse_env.schedules import best_queries, make_schedule, option_values
+from dptse_env.schedules import best_queries, make_schedule, query_values
 from tests.helpers import SumRelease, make_env
 
 from .playing import begin, make_batch
@@ -196,13 +196,13 @@ def test_an_option_is_worth_the_mean_of_its_segments_for_its_cost():
     free = np.zeros(0, dtype=np.int64)
     value = np.array([[1.0, 2.0, 3.0, 0.0]])
     sums = Queries.make(4, 2, (1, 2), unit="sums")
-    assert option_values(sums, value, free).tolist() == [[1, 2, 3, 0, 1.5, 2.5, 1.5]]
+    assert query_values(sums, value, free).tolist() == [[1, 2, 3, 0, 1.5, 2.5, 1.5]]
     segments = Queries.make(4, 2, (1, 2))
-    assert option_values(segments, value, free).tolist() == [[1, 2, 3, 0, 0.75, 1.25, 0.75]]
+    assert query_values(segments, value, free).tolist() == [[1, 2, 3, 0, 0.75, 1.25, 0.75]]
     # A fixed sensor makes a segment worth the least of the others.
     value, sensors = np.array([[4.0, 2.0, 9.0, 9.0]]), np.array([2, 3])
     expected = [4, 2, -np.inf, -np.inf, 3, 2, -np.inf]
-    assert option_values(sums, value, sensors).tolist() == [expected]
+    assert query_values(sums, value, sensors).tolist() == [expected]
 
 
 @pytest.mark.parametrize(

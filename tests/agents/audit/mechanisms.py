@@ -115,7 +115,7 @@ MECHANISMS = {
     for name, kind in {
         "half the noise": partial(Noise, scale=0.5),
         "four fifths of the noise": partial(Noise, scale=0.8),
-        "one noise for two columns": SharedByTwo,
+        "one noise for two channels": SharedByTwo,
         "one noise for counts and deviations": OneForBoth,
         "32 s of noise again and again": Again,
         "32 s of noise once more": AgainOnce,
