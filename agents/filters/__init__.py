@@ -1,1 +1,1 @@
-"""Training of learned estimators on simulated traffic."""
+"""Training of the recurrent network on simulated traffic."""

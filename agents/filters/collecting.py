@@ -1,7 +1,7 @@
-"""Episodes of scenarios: what an estimator is given, beside the true traffic, and batches of them.
+"""Episodes of scenarios, with an estimator's inputs and the true traffic, and batches of them.
 
-A batch mixes scenarios on any roads. What the network reads of releases depends on what it
-predicted, so that it is read anew in every pass, by the estimator's own kernel.
+A batch mixes scenarios on any roads. The features of the network depend on its own predictions, so
+every pass computes them anew, with the estimator's own kernel.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from agents.filters.network import Roads
 from agents.filters.scenarios import Scenario
 from agents.play import record
 from dptse_env.estimators import Measurement
-from dptse_env.estimators.recurrent_kernels import N_CHANNELS, Cells, Memory, make_cells, read
+from dptse_env.estimators.recurrent_kernels import N_FEATURES, Cells, Memory, make_cells, read
 from dptse_env.evaluation import Row, evaluate
 from dptse_env.model import Channels
 from dptse_env.process import QueryProcess
@@ -42,7 +42,7 @@ class Episodes:
         corridor: The road.
         is_section: Whether it is a section of a highway.
         channels: What is measured.
-        cells: The road as the network sees it.
+        cells: The features of the road.
         start: Density [veh/km] and speed [km/h] of the prior and their deviations, (k, S, 4).
         observed: Which channels were measured, (T, k, M).
         values: Measurements, (T, k, M, 2).
@@ -125,7 +125,7 @@ def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
 
 
 class _Recorder:
-    """An estimator that writes down what it is given."""
+    """An estimator that records its inputs."""
 
     def __init__(self, process: QueryProcess) -> None:
         self._estimator, self._process = process.estimator, process
@@ -136,12 +136,12 @@ class _Recorder:
         return getattr(self._estimator, name)
 
     def predict(self, episodes: Any, inputs: Any) -> None:
-        """Write down the inputs, and predict."""
+        """Record the inputs, and predict."""
         self.inputs.append(inputs.copy())
         self._estimator.predict(episodes, inputs)
 
     def update(self, episodes: Any, measured: Measurement) -> None:
-        """Write down the measurements, and update."""
+        """Record the measurements, and update."""
         model = self._process.model
         own = measured.on_road(model.channels.size, model.n_segments)
         self.measured.append(tuple(array.copy() for array in own))
@@ -149,7 +149,7 @@ class _Recorder:
 
 
 class _Watcher:
-    """Writes down the prior, and the truth of every second; adds no columns to rows."""
+    """Records the prior and the truth of every second; adds nothing to the results."""
 
     def __init__(self, process: QueryProcess) -> None:
         self._process = process
@@ -183,7 +183,7 @@ def draw_batch(rng: np.random.Generator, collected: Sequence[Episodes], n: int) 
 
 
 class Batch:
-    """Episodes of several scenarios as a training takes them: C cells of any roads in a row.
+    """Episodes of several scenarios, with the C cells of all their roads in one array.
 
     Attributes:
         roads: The cells.
@@ -192,7 +192,7 @@ class Batch:
     """
 
     def __init__(self, parts: Sequence[Episodes]) -> None:
-        """Take scenarios of equally many seconds."""
+        """Take episodes with the same number of seconds."""
         self._parts = parts
         sizes = [len(part.start) * part.corridor.road.n_segments for part in parts]
         ends = np.cumsum([0, *sizes])
@@ -204,19 +204,19 @@ class Batch:
 
     @property
     def ordinary(self) -> Batch | None:
-        """The episodes that are not on sections, which are the first ones; None without any."""
+        """The episodes that are not on sections, which come first; None if there are none."""
         parts = [part for part in self._parts if not part.is_section]
         return Batch(parts) if parts else None
 
-    def channels(self, t: int, predicted: FloatArray, age: FloatArray) -> Tensor:
-        """Return what the network reads in second t + 1, shape (C, channels).
+    def features(self, t: int, predicted: FloatArray, age: FloatArray) -> Tensor:
+        """Return the features of second t + 1, shape (C, `N_FEATURES`).
 
         Args:
             t: Index of the second.
-            predicted: Prediction of that second and its deviations, shape (C, 4).
-            age: Seconds since the last measurement, shape (C,), counted on.
+            predicted: Prediction of that second with its deviations, shape (C, 4).
+            age: Seconds since the last measurement, shape (C,); updated.
         """
-        x = np.empty((len(age), N_CHANNELS), dtype=np.float32)
+        x = np.empty((len(age), N_FEATURES), dtype=np.float32)
         for part, place in zip(self._parts, self._places, strict=True):
             k = len(part.start)
             memory = Memory(
@@ -227,7 +227,7 @@ class Batch:
             )
             measured = Measurement(part.observed[t], part.values[t], part.sigma[t], part.centre[t])
             bundle = Bundle(part.corridor.road, part.channels, part.cells, memory)
-            read(bundle, np.arange(k), measured, x[place].reshape(k, -1, N_CHANNELS))
+            read(bundle, np.arange(k), measured, x[place].reshape(k, -1, N_FEATURES))
         return torch.from_numpy(x)
 
 

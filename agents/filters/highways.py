@@ -1,8 +1,7 @@
-"""Random highways of some three kilometres, and sections of them, that traffic enters as it comes.
+"""Random highways of some three kilometres, and sections of them that queues enter from outside.
 
-On a road that SUMO simulates, vehicles enter freely and leave freely. On a section of a longer one
-queues also come in through the downstream end, or arrive from upstream, which is what measured
-roads are like.
+On a road that SUMO simulates, vehicles enter and leave freely. On a section of a longer one, queues
+also come in through the downstream end or arrive from upstream, as on measured roads.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.arrays import FloatArray, IntArray
 
 DURATION, WARM_UP = 1150, 100
-"""Length of a highway's record, and its seconds in which it fills [s]."""
+"""Length of a highway's record, and of its beginning in which the road fills [s]."""
 LANES, LENGTHS, LIMITS = (1, 6), (0.05, 0.25), (60.0, 130.0)
 """Ranges of lanes, lengths of segments [km] and speed limits [km/h]."""
 SEGMENTS = (5, 60)
@@ -32,17 +31,17 @@ SEGMENTS = (5, 60)
 KILOMETRES = (2.5, 4.0)
 """Range of the length of a highway [km]."""
 CAPACITY = 1950.0
-"""Flow of a lane [veh/h] by which demands are drawn."""
+"""Flow of a lane [veh/h] that demands are drawn as shares of."""
 HEADWAYS = {"W99": (0.7, 1.6), "IDM": (0.9, 1.9), "Krauss": (0.8, 1.6)}
 """Desired time headways of drivers by their model [s]."""
 CANDIDATES, FREE = 24, 0.3
-"""Windows among which a section's are drawn, and the weight of one without any queue."""
+"""Windows among which those of a section are drawn, and the weight of one without queues."""
 SLOW, LASTING = 0.5, 0.15
-"""A queue has speeds below this share of the limit, for at least this share of the time."""
+"""In a queue, speeds are below this share of the limit for at least this share of the time."""
 
 
 def draw_highway(number: int) -> Corridor:
-    """Return the highway of a number: the same whenever it is called.
+    """Return the highway of a number, always the same one.
 
     Bottlenecks are temporary limits, most of them at the downstream end; more than half of them
     alternate every 20 to 90 s and send waves upstream. In one of seven there is little traffic.
@@ -140,11 +139,11 @@ class Section:
     """A section of a highway, with several windows of time.
 
     Attributes:
-        highway: Number of the highway.
-        segments: Number of its segments, fewer by two at least than the highway's.
+        highway: Number of the highway (`draw_highway`).
+        segments: Number of its segments, at least two fewer than the highway has.
         windows: Number of windows; each is the record of a traffic seed, from 0 on.
         seconds: Length of a window [s].
-        averaged: Seconds over which densities and speeds are averaged, as detectors do: the record
+        averaged: Seconds over which densities and speeds are averaged, as detectors do. The record
             is then a field without vehicles; 0 for the vehicles of every second.
         sensors: Segments of the mainline that are measured every second.
         seed: Seed of place and times.
@@ -186,7 +185,7 @@ class Section:
         return folder / ROAD
 
     def _place(self, highway: Corridor, record: Record) -> tuple[int, list[int]]:
-        """Return the first segment and the windows' starts; where there are queues is likelier."""
+        """Return a first segment and the starts of windows, drawn preferably with queues."""
         rng = np.random.default_rng([78, self.highway, self.segments, self.seed])
         n = highway.geometry.n_mainline
         lengths, limits = highway.road.lengths, highway.road.limits
@@ -211,7 +210,7 @@ class Section:
 
 
 def _section(highway: Corridor, first: int, section: Section) -> tuple[Corridor, IntArray]:
-    """Return a section as a road, and the highway's record column of each of its own."""
+    """Return a section as a road, and the columns of its cells in the highway's record."""
     n, lanes = section.segments, highway.geometry.segment_lanes[first : first + section.segments]
     mainline = range(first, first + n)
 
@@ -269,7 +268,7 @@ def _cut(record: Record, columns: IntArray, start: int, seconds: int) -> Record:
 
 
 def _averaged(road: Corridor, record: Record, seconds: int) -> Record:
-    """Return densities and mean speeds over some seconds around, as a field."""
+    """Return running means of densities and speeds over some seconds, as a field."""
     counts, speeds = (
         uniform_filter1d(each.astype(float), seconds, axis=0, mode="nearest")
         for each in (record.counts, record.speed_sums)

@@ -1,4 +1,4 @@
-"""The recurrent network in torch, with gradients, and the loss that it is trained by."""
+"""The recurrent network in torch, and the loss that it is trained on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dptse_env.estimators.recurrent_kernels import (
 
 
 class Roads(NamedTuple):
-    """The cells of k episodes one after another, whatever their roads, and how errors count."""
+    """The cells of k episodes in a row, on any roads, with the units of their errors."""
 
     unit: Tensor  # (C,) of densities [veh/km]
     limit: Tensor  # (C,) unit of speeds [km/h]
@@ -38,7 +38,7 @@ class Roads(NamedTuple):
 
 
 class RecurrentNetwork(nn.Module):
-    """The network of `dptse_env.estimators.recurrent_kernels`, with gradients."""
+    """The network of `dptse_env.estimators.recurrent_kernels` as a torch module."""
 
     inputs: Tensor
     inputs_bias: Tensor
@@ -48,7 +48,7 @@ class RecurrentNetwork(nn.Module):
     heads_bias: Tensor
 
     def __init__(self, width: int) -> None:
-        """Draw orthogonal hidden weights, and inputs' weights by their number."""
+        """Draw hidden weights as orthogonal matrices, the others at random."""
         super().__init__()
         self.width = width
         for name, shape in shapes(width).items():
@@ -72,8 +72,8 @@ class RecurrentNetwork(nn.Module):
 
         Args:
             roads: The cells.
-            x: Their channels, as `recurrent_kernels.read` writes them, shape (C, channels).
-            h: Hidden states before, shape (C, H).
+            x: Their features, as `recurrent_kernels.read` writes them, shape (C, `N_FEATURES`).
+            h: Hidden states before that second, shape (C, H).
         """
         H = self.width
         messages = h[..., : message_width(H)]
@@ -89,7 +89,7 @@ class RecurrentNetwork(nn.Module):
         return n + z * (h - n)
 
     def read(self, roads: Roads, h: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the heads say of hidden states (..., C, H): of this second, and the next.
+        """Return the estimates of hidden states (..., C, H), for this second and for the next.
 
         Density [veh/km], speed [km/h] and their standard deviations, shape (..., C, 4) each.
         """
@@ -154,9 +154,9 @@ def second_loss(
 
 
 def teacher_loss(roads: Roads, estimated: Tensor, taught: Tensor) -> Tensor:
-    """Return how far estimates are from those of a teacher, averaged over all cells.
+    """Return the distance of estimates from those of a teacher, averaged over all cells.
 
-    Ten times the squared difference of means, on the scale of errors, and 0.03 times that of the
+    Ten times the squared difference of means, in units of errors, plus 0.03 times that of the
     logarithms of deviations. Both arguments have shape (..., C, 4).
     """
     means = (estimated[..., :2] - taught[..., :2]) / roads.scales

@@ -1,6 +1,6 @@
 """Plan of the training of a recurrent network: rounds of scenarios, and passes over them.
 
-The plan decides all numbers of a training, and says on the card of the weights what it was.
+The plan decides all numbers of a training, and stands on the card of the weights.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.recurrent import FORMAT, read_weights
-from dptse_env.estimators.recurrent_kernels import CHANNELS
+from dptse_env.estimators.recurrent_kernels import FEATURES
 from dptse_env.utils.validation import Interval, checked_fields, integer, require
 from dptse_env.versions import versions_with
 
@@ -34,11 +34,11 @@ class Round:
     """Scenarios that are collected with one estimator, and passes over them.
 
     Attributes:
-        estimator: The estimator that is played: a name, or `OWN` for the network itself, as it
-            stands when the round begins. Centres and prices of ``paced`` and the schedules on
+        estimator: The estimator that is played: a name, or `OWN` for the network with its weights
+            at the beginning of the round. Centres and prices of ``paced`` and the schedules on
             deviations follow it.
         scenarios: Number of scenarios; those of earlier rounds are dropped.
-        passes: Number of passes over a batch of episodes, each drawn at random.
+        passes: Number of passes, each over a batch of episodes drawn at random.
     """
 
     estimator: str
@@ -55,7 +55,7 @@ OWN = "own"
 
 
 def played_by(weights: Path) -> dict[str, Any]:
-    """Return the keywords of an environment whose estimator has weights of a file."""
+    """Return the keywords of an environment whose estimator has the weights of a file."""
     settings = {"recurrent": {"weights": str(weights.resolve())}}
     return {"estimator": "recurrent", "estimator_settings": settings}
 
@@ -71,12 +71,12 @@ VALIDATION: dict[Kind, tuple[str, ...]] = {
         'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected"}',
     ),
 }
-"""Environments that a training validates in."""
+"""Environments to validate in."""
 ON_SECTIONS: dict[Kind, dict[str, Any]] = {
     "flows": {"preset": "paced", "boundary_inputs": "nominal"},
     "speeds": {"preset": "corrected", "epsilon": 1.0},
 }
-"""Release models on the sections that a training validates on."""
+"""Release models on the sections to validate on."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ class FilterPlan:
         traffic_seeds: Traffic seeds to train on.
         validation_seeds: Traffic seeds to validate on.
         validation_envs: Environments to validate in, as ``ID`` or ``ID {JSON}``.
-        validation_highways: First and last number of the highways to validate on, the last one left
-            out: a section of each.
+        validation_highways: Numbers (first, stop) of the highways to validate on, with a section of
+            each.
         ranges: Ranges that scenarios are drawn from.
         rounds: Rounds, one after the other.
         width: Width of the hidden state.
@@ -98,15 +98,15 @@ class FilterPlan:
         episodes: Episodes of a batch, which mixes scenarios on any roads.
         seconds: Length of an episode [s].
         window: Seconds over which gradients are propagated.
-        learning_rate: Of Adam at the beginning; it falls along a cosine.
+        learning_rate: First learning rate of Adam; it falls along a cosine.
         likelihood: Weight of the likelihood in the loss.
         prediction: Weight of the loss of predictions.
         clip_norm: Largest norm of a gradient.
         checkpoint_every: Passes between checkpoints.
         initial: Weights that the training begins with, a name or a file; None to draw them at
             random.
-        teacher: Part of the loss on ordinary roads that holds the network to what it says there
-            with the initial weights.
+        teacher: Share of the loss on ordinary roads that is the distance from the estimates of the
+            initial weights.
 
     Raises:
         ValueError: A value is out of range.
@@ -169,7 +169,7 @@ class FilterPlan:
         return sum(each.passes for each in self.rounds)
 
     def scenarios(self, index: int) -> list[Scenario]:
-        """Return the scenarios of a round, those on sections first; always the same ones."""
+        """Return the scenarios of a round, always the same ones, those on sections first."""
         rng = np.random.default_rng([self.seed, index])
         n = self.rounds[index].scenarios
         on_sections, first = round(self.ranges.sections * n), TUNING.start
@@ -195,7 +195,7 @@ class FilterPlan:
         return plain
 
     def validation_sections(self) -> list[Section]:
-        """Return the sections that are validated on, with queues of any kind."""
+        """Return the sections to validate on."""
         numbers = range(*self.validation_highways)
         longest = [draw_highway(number).geometry.n_mainline - 2 for number in numbers]
         return [
@@ -225,7 +225,7 @@ class FilterPlan:
         return cells
 
     def card(self, done: int, name: str) -> dict[str, Any]:
-        """Return the card of the weights after `done` passes: what they were trained on."""
+        """Return the card of the weights after `done` passes, with the ranges of their training."""
         ranges = self.ranges
         roads = [make_config(*parse_env(each)).corridor for each in ranges.envs]
         found: dict[str, list[float]] = {
@@ -246,7 +246,7 @@ class FilterPlan:
         return {
             "name": name,
             "format": FORMAT,
-            "channels": list(CHANNELS),
+            "channels": list(FEATURES),
             "ranges": {key: [min(values), max(values)] for key, values in found.items()},
             "training": {
                 "plan": self.settings(),

@@ -1,6 +1,6 @@
-"""Scenarios to learn an estimator from: environments, query policies and seeds, drawn at random.
+"""Scenarios to train an estimator on: environments, query policies and seeds, drawn at random.
 
-A training takes its scenarios from `ScenarioRanges.draw` alone: other roads are other ``envs``.
+All scenarios of a training come from `ScenarioRanges.draw`. For other roads give other ``envs``.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from agents.filters.highways import SEGMENTS, Section, draw_highway
 from dptse_env.utils.validation import Interval, checked_fields, require
 
 Kind = Literal["flows", "speeds"]
-"""Kind of the numbers that are released beside densities; weights are for one kind."""
+"""Kind of the numbers that are released beside densities; weights suit one kind."""
 MECHANISMS: dict[Kind, tuple[str, ...]] = {
     "flows": ("capped", "paced"), "speeds": ("paper", "corrected"),
 }  # fmt: skip
-"""Release models that scenarios draw from."""
+"""Release models of scenarios."""
 SCHEDULES = (
     "round-robin", "paper", "random", "oldest-first", "static", "stale-variance",
     "largest-variance", "largest-deviation", "expected-reduction",
 )  # fmt: skip
-"""Query policies that scenarios draw from; the last four follow the estimator's own deviations."""
+"""Query policies of scenarios; the last four follow the estimator's own deviations."""
 BOUNDARIES: dict[Kind, dict[str, float]] = {
     "flows": {"true": 0.3, "nominal": 0.45, "private": 0.25},
     "speeds": {"true": 0.8, "nominal": 0.1, "private": 0.1},
@@ -113,11 +113,11 @@ class ScenarioRanges:
     Attributes:
         envs: Environments, each an id or an id, a space and keywords as JSON (`parse_env`).
         sections: Share of the scenarios that are on sections of highways, not in one of `envs`.
-        highways: First and last number of these highways, the last one left out.
+        highways: Numbers (first, stop) of these highways.
         schedules: Query schedules.
-        epsilon: Range of epsilon, drawn evenly in its logarithm.
+        epsilon: Range of epsilon, drawn log-uniformly.
         deltas: Values of delta.
-        caps: Range of the cap of ``capped``, drawn evenly in its logarithm.
+        caps: Range of the cap of ``capped``, drawn log-uniformly.
         clips: Range of the clip of ``paced`` [km/h].
         paces: Range of the pace of ``paced``.
         spans: Spans of queries under ``paced``.
@@ -154,7 +154,7 @@ class ScenarioRanges:
     ) -> Scenario:
         """Draw a scenario.
 
-        The bandwidth is drawn from 1 to all segments, evenly in its square root.
+        The square root of the bandwidth, from 1 to all segments, is drawn uniformly.
 
         Args:
             rng: Source of randomness.

@@ -1,4 +1,4 @@
-"""`FilterTraining`: runs a plan in a folder, and continues there after an interruption."""
+"""`FilterTraining`: a training in a folder, which continues there after an interruption."""
 
 from __future__ import annotations
 
@@ -64,27 +64,27 @@ def _begin(batch: Batch, width: int) -> State:
 def _advance(
     network: RecurrentNetwork, batch: Batch, window: range, state: State
 ) -> tuple[State, Tensor, Tensor]:
-    """Return the state after some seconds, and what a network says of them and of the next ones."""
+    """Return the state after some seconds, and the estimates of them and of the next ones."""
     (hidden, predicted, age), kept = state, []
     hidden = hidden.detach()
     for t in window:
-        hidden = network(batch.roads, batch.channels(t, predicted, age), hidden)
+        hidden = network(batch.roads, batch.features(t, predicted, age), hidden)
         predicted = network.read(batch.roads, hidden.detach())[1].detach().numpy().astype(float)
         kept.append(hidden)
     return State(hidden, predicted, age), *network.read(batch.roads, torch.stack(kept))
 
 
 class FilterTraining:
-    """A plan in a folder: a network, its optimiser, learning curve and checkpoints.
+    """A training in a folder: a network, its optimiser, learning curve and checkpoints.
 
     A training that was killed continues from its last checkpoint to the same numbers, on the same
     machine with the same number of torch's threads. Scenarios are not stored: they are collected
-    again, with the weights that played them at first.
+    again, with the weights of the first time.
 
     Attributes:
         plan: The plan.
         folder: The folder.
-        network: The network as the last update left it; its moving average is played and kept.
+        network: The network after the last update; its moving average is played and saved.
         done: Number of passes that are done.
         rows: The learning curve so far.
     """
@@ -98,7 +98,7 @@ class FilterTraining:
         watchers: Sequence[Watcher] = (),
         executor: AnyExecutor = THIS_PROCESS,
     ) -> None:
-        """Take the folder and restore its state.
+        """Restore the state of the folder, if there is one.
 
         Args:
             plan: The plan.
@@ -135,7 +135,7 @@ class FilterTraining:
                 self._watch(row)
 
     def run(self) -> None:
-        """Train to the end of the plan, and leave the weights beside the checkpoint."""
+        """Train to the end of the plan, and save the weights beside the checkpoint."""
         last = 0
         for index, each in enumerate(self.plan.rounds):
             first, last = last, last + each.passes
@@ -189,7 +189,7 @@ class FilterTraining:
     def _window(
         self, batch: Batch, taught: Batch | None, window: range, states: list[State]
     ) -> tuple[float, float]:
-        """Update the weights by some seconds and replace the states; return loss and error."""
+        """Update the weights on some seconds and replace the states; return loss and error."""
         plan, network, roads = self.plan, self.network, batch.roads
         states[0], present, ahead = _advance(network, batch, window, states[0])
         truth, after = (batch.truth[window.start + k : window.stop + k] for k in (0, 1))
@@ -232,7 +232,7 @@ class FilterTraining:
         return found
 
     def _validation_roads(self) -> list[Path]:
-        """Return the road files of the sections to validate on, which are written once."""
+        """Return the road files of the sections to validate on; write those that are missing."""
         library, roads = open_library(self._records), list[Path]()
         for section in self.plan.validation_sections():
             folder = self.folder / SECTIONS / str(section.highway)

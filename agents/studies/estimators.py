@@ -111,7 +111,7 @@ def world_cell(
     network: int = 0,
     weights: str = "highway",
 ) -> Cell:
-    """Return the cell of an estimator in a world; network 0 is the one of the package."""
+    """Return the cell of an estimator in a world; network 0 has the weights of the package."""
     env, changes = {**WORLDS, **ELSEWHERE}[world]
     keywords = {**changes, "estimator": estimator}
     if estimator == LEARNED:
@@ -476,7 +476,7 @@ STUDY = Study("estimators", (*WORLD_CELLS, *SENSED_CELLS), SEEDS, report)
 
 
 def study(weights: Sequence[str]) -> Study:
-    """Return the study with networks of other training seeds, numbered from 1 on."""
+    """Return the study with weights of other training seeds, numbered from 1 on."""
     more = [
         world_cell(world, LEARNED, network=number, weights=each)
         for world, (number, each) in product(WORLDS, enumerate(weights, start=1))

@@ -164,7 +164,7 @@ def recorded_rows() -> pl.DataFrame:
 
     Raises:
         ValueError: A reference was played with other numbers than those of this version, or with
-            other weights of the network.
+            other weights.
     """
     rows = _present(read_table(RECORDED / ROWS))
     rows = rows.filter(are_present(rows))
@@ -180,7 +180,7 @@ def recorded_rows() -> pl.DataFrame:
 
 
 def _present(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows without those of networks and policies that came with the package before."""
+    """Return the rows without those of weights and policies that came with the package before."""
     return rows.filter(
         pl.col("cell").is_in([each.id for each in (*rule_cells(), *learned_cells())])
     )

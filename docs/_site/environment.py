@@ -78,7 +78,7 @@ def draw_estimators() -> Figure:
 
 
 def on_private_highway(rows: pl.DataFrame) -> dict[str, Interval]:
-    """Return errors on PrivateHighway-v1; networks are those that ship."""
+    """Return errors on PrivateHighway-v1; weights are those that ship."""
     own = rows.filter(pl.col("network").fill_null(0) == 0)
     labels = {"part": "estimators", "world": "PrivateHighway-v1", "policy": "round-robin"}
     names = own.filter(*(pl.col(key) == label for key, label in labels.items()))["estimator"]

@@ -1,7 +1,7 @@
-"""A recurrent network as an estimator, trained on simulated traffic.
+"""The recurrent network as an estimator, trained on simulated traffic.
 
-Its weights are files (`read_weights`): the arrays `Weights`, and a card that says what traffic
-they were trained on.
+Files of weights (`read_weights`) have the arrays `Weights`, and a card with the roads and releases
+that they were trained on.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from dptse_env.estimators.base import Estimate, KernelEstimator
 from dptse_env.estimators.recurrent_kernels import (
-    CHANNELS,
+    FEATURES,
     LONGEST_AGE,
     Memory,
     State,
@@ -38,7 +38,7 @@ from dptse_env.utils.kernels import Bundle
 
 LARGEST_WIDTH = 512
 FORMAT = "recurrent-2"
-"""Name of the channels' order and meaning; another one is refused."""
+"""Name of the features' order and meaning; another one is refused."""
 
 SHIPPED = ("highway", "long-highway", "roads")
 """Pairs that come with the package, each trained on more kinds of roads than those before it."""
@@ -47,12 +47,12 @@ _FOLDER, _SUFFIX = Path(__file__).parent / "weights", ".safetensors"
 
 
 class Recurrent(KernelEstimator):
-    """A gated recurrent unit in every cell of the road.
+    """A gated recurrent unit in every cell of the road (`recurrent_kernels`).
 
-    All cells share the weights and see the releases that cover them, the predictions of the second
-    before, the model's inputs at their ends, and the hidden states of the cells next to them. The
-    traffic model is not used. Deviations are those that the network reports; estimates of
-    different cells and of density and speed count as independent.
+    All cells have the same weights. A cell reads the releases that cover it, the prediction of its
+    state, the model's inputs at its ends and the hidden states of its neighbours. The traffic
+    model is not used. Deviations are outputs of the network; errors of different cells, and of
+    density and speed, count as independent.
 
     Attributes:
         saved: The weights in force, with their card.
@@ -244,9 +244,9 @@ def write_weights(path: str | os.PathLike[str], weights: Weights, card: Mapping[
 
 def _checked(arrays: Mapping[str, AnyArray], card: Mapping[str, Any]) -> Weights:
     """Return the weights of a file's arrays and card, or refuse them."""
-    if card.get("format") != FORMAT or card.get("channels") != list(CHANNELS):
+    if card.get("format") != FORMAT or card.get("channels") != list(FEATURES):
         raise ValueError(
-            f"it has channels of format {card.get('format')!r}, this version reads {FORMAT!r}"
+            f"it has features of format {card.get('format')!r}, this version reads {FORMAT!r}"
         )
     ranges = card.get("ranges")
     if not isinstance(ranges, dict):

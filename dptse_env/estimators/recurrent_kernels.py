@@ -1,28 +1,28 @@
-"""The step of a recurrent network, compiled, for blocks of episodes: its inputs and its weights.
+"""The compiled step of the recurrent network: its features, its weights and its state.
 
-A release is read as by a Kalman filter to which the errors of different cells, and of density and
-speed, are independent. A channel m of a measurement averages over its cells two numbers:
-densities rho, and y = rho (v - centre) where flows are released, or y = v where speeds are. The
-prediction of a cell has the variances P_rho, P_v and hence P_y. With the variance V_m of a
-channel's innovation e_m, the measured less the predicted average, noise included, a cell's gain and
-correction are, over the channels that cover it,
+Features are made of a release as by a Kalman filter that takes the errors of different cells, and
+of density and speed, as independent. Channel m of a release averages two numbers over its cells:
+the density rho, and y = rho (v - centre) where flows are released, or y = v where speeds are. The
+prediction of a cell has the variances P_rho, P_v and hence P_y. The innovation e_m of a channel is
+its measurement less the predicted average; V_m is its variance, noise included. The gain and the
+correction of a cell are, over the channels that cover it,
 
     K_ms = P_s / (span_m V_m)      d_s = sum_m K_ms e_m
 
-The network gets innovations over their deviations, corrections and gains. So the deviation of the
+Features are innovations over their deviations, corrections and gains. So the deviation of the
 noise, which ranges over three orders of magnitude between mechanisms and budgets, is taken into
 account before the network sees a release.
 
-A gated recurrent unit (Cho et al., 2014) in every cell of a road, with the same weights, reads the
-cell's channels x and the sums u and d of the messages of the cells upstream and downstream: the
-first 16 numbers of their hidden states.
+Every cell of a road has a gated recurrent unit (Cho et al., 2014) with the same weights. It reads
+the features x of the cell, and the sums u and d of the messages of the cells upstream and
+downstream: the first 16 numbers of their hidden states.
 
     z = sigma(W_z [x, u, d] + b_z + V_z h + c_z)
     r = sigma(W_r [x, u, d] + b_r + V_r h + c_r)
     n = tanh(W_n [x, u, d] + b_n + r * (V_n h + c_n))
     h <- z * h + (1 - z) * n
 
-Eight linear heads read h: density, speed and the logarithms of their deviations, for this second
+Eight linear heads of h are density, speed and the logarithms of their deviations, for this second
 and for the next one before its release.
 """
 
@@ -41,25 +41,25 @@ from dptse_env.utils.kernels import Bundle, all_finite, inline_part, kernel, ker
 
 Float32Array = NDArray[np.float32]
 
-CHANNELS = (
+FEATURES = (
     "queried", "share", "log_density_sigma", "log_second_sigma", "predicted_density",
     "predicted_speed", "log_density_deviation", "log_speed_deviation", "density_innovation",
     "second_innovation", "density_correction", "density_correction_by_flow", "speed_correction",
     "density_gain", "speed_gain", "slip", "flows", "log_age", "inflow", "outside_density",
     "on_ramp", "off_ramp", "entry", "exit", "lanes", "log_length", "log_limit",
 )  # fmt: skip
-"""The inputs of the network for each cell."""
-N_CHANNELS = len(CHANNELS)
+"""The features of a cell."""
+N_FEATURES = len(FEATURES)
 
 LONGEST_AGE = 300.0
 """Seconds since a measurement after which a cell counts as never measured."""
 LEAST_SIGMA, LARGEST_SIGMA = 0.1, 1e6
-"""Range of deviations whose logarithms the network sees [veh/km, km/h or veh/h]."""
+"""Range of deviations whose logarithms are features [veh/km, km/h or veh/h]."""
 LEAST_VARIANCE = 1e-12
 LARGEST_INNOVATION = 6.0
-"""Largest innovation, in deviations, that the network sees."""
+"""Largest innovation among the features, in deviations."""
 LARGEST_CORRECTION = 2.0
-"""Largest correction that the network sees, in units of density or speed limits."""
+"""Largest correction among the features, in units of density or speed limits."""
 
 DENSITY_UNIT = 40.0
 """Unit of densities [veh/km] for each lane, between free flow and a jam."""
@@ -69,7 +69,7 @@ SPEED_RANGE = 1.1
 """Largest speed that is estimated, in speed limits."""
 
 N_FIXED = 7
-"""Numbers of a cell that never change."""
+"""Number of the features of a cell that never change."""
 
 N_HEADS = 8
 MESSAGE = 16
@@ -81,16 +81,16 @@ _ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
 
 class Cells(NamedTuple):
-    """Inputs of the network about the cells of a road, which never change."""
+    """Features of the cells of a road that never change, and their units."""
 
     unit: FloatArray  # (S + R,) unit of densities [veh/km]
     limit: float  # largest speed limit [km/h], the unit of speeds
     flows: bool  # whether flows are released, otherwise speeds
-    fixed: FloatArray  # (S, N_FIXED) inputs of the network
+    fixed: FloatArray  # (S, N_FIXED) features
 
 
 def make_cells(model: ARZModel) -> Cells:
-    """Return the inputs of the network about a model's road."""
+    """Return the fixed features of a model's road."""
     road, S = model.road, model.n_segments
     n_on = road.entries.size - 1
     marks = np.zeros((S, 4))
@@ -109,7 +109,7 @@ def make_cells(model: ARZModel) -> Cells:
 
 
 class Weights(NamedTuple):
-    """Weights of a network of width H with C channels and messages of M numbers, float32."""
+    """Weights of a network of width H with C features and messages of M numbers, float32."""
 
     inputs: Float32Array  # W, (C + 2 M, 3 H)
     inputs_bias: Float32Array  # b, (3 H,)
@@ -131,7 +131,7 @@ def message_width(width: int) -> int:
 
 def shapes(width: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of `Weights` of some width by name."""
-    n_inputs = N_CHANNELS + 2 * message_width(width)
+    n_inputs = N_FEATURES + 2 * message_width(width)
     return {
         "inputs": (n_inputs, 3 * width),
         "inputs_bias": (3 * width,),
@@ -143,7 +143,7 @@ def shapes(width: int) -> dict[str, tuple[int, ...]]:
 
 
 class Memory(NamedTuple):
-    """Inputs of the network beside the releases, of n episodes, and its estimates."""
+    """Predictions, estimates and inputs of n episodes that features are made of."""
 
     inputs: FloatArray  # (n, n_u) the model's inputs of the last prediction
     present: FloatArray  # (n, S, 4) predictions, then estimates, and their deviations
@@ -179,7 +179,7 @@ def _restart(memory: Memory, state: State, e: int) -> None:
 
 @kernel
 def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
-    """Take what was estimated of the next second, and keep the inputs `(k, n_u)`."""
+    """Take the prediction of the next second, and keep the inputs `(k, n_u)`."""
     _, _, _, memory, _, state = bundle.parts
     for k in range(episodes.size):
         memory.present[episodes[k]] = state.ahead[episodes[k]]
@@ -188,7 +188,7 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
 
 @kernel
 def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
-    """Advance the network by what was released of episodes `(k,)`."""
+    """Advance the network by the releases of episodes `(k,)`."""
     road, _, _, memory, weights, state = bundle.parts
     x = np.empty((episodes.size, road.n_segments, weights.inputs.shape[0]), np.float32)
     read(bundle, episodes, measured, x)
@@ -206,14 +206,14 @@ def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
 
 @kernel
 def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Array) -> None:
-    """Write the network's inputs of all cells, and innovations; count the age of measurements on.
+    """Write the features of all cells, and innovations; update the ages of measurements.
 
     Args:
         bundle: Road, channels, `Cells` and `Memory`, whose age and innovations are updated; more
             parts may follow.
         episodes: Shape (k,).
         measured: The release of the k episodes.
-        x: Output, shape (k, S, `N_CHANNELS` or more).
+        x: Output, shape (k, S, `N_FEATURES` or more).
     """
     road, channels, cells, memory = bundle.parts[:4]
     inputs, present, age, innovations = memory
@@ -270,7 +270,7 @@ def _read_channel(
     sums: FloatArray,
     innovation: FloatArray,
 ) -> None:
-    """Write the innovation of a channel, and add what it says to the sums of its cells."""
+    """Write the innovation of a channel, and add its terms to the sums of its cells."""
     span = len(prior)
     share = 1.0 / span
     for j in range(2):
@@ -301,7 +301,7 @@ def _write(
     age: float,
     row: Float32Array,
 ) -> None:
-    """Write the channels of a cell, by what the channels that cover it say."""
+    """Write the features of a cell, from the sums over the channels that cover it."""
     unit, limit, flows = cells.unit[s], cells.limit, 1.0 if cells.flows else 0.0
     by_speed, slip = second[2], second[3]
     density_variance, speed_variance = prior[2] ** 2, prior[3] ** 2
@@ -331,28 +331,28 @@ def _correction(value: float) -> float:
 
 @kernel
 def advance(bundle: Bundle, episodes: IntArray, x: Float32Array) -> None:
-    """Advance the hidden states, and write what the heads read from them.
+    """Advance the hidden states, and write the estimates of their heads.
 
     Args:
         bundle: Road, channels, `Cells`, `Memory`, `Weights` and `State`.
         episodes: Shape (k,).
-        x: Shape (k, S, C + 2 M): the channels, and space for sums of messages.
+        x: Shape (k, S, C + 2 M): the features, and space for sums of messages.
     """
     road, _, cells, memory, weights, state = bundle.parts
     present, hidden, ahead = memory.present, state.hidden, state.ahead
     S, H = road.n_segments, weights.hidden.shape[0]
-    M = (weights.inputs.shape[0] - N_CHANNELS) // 2
+    M = (weights.inputs.shape[0] - N_FEATURES) // 2
     g, q = np.empty((S, 3 * H), dtype=np.float32), np.empty((S, 3 * H), dtype=np.float32)
     raw = np.empty((S, weights.heads.shape[1]), dtype=np.float32)
     # One product for each episode: its bits then do not depend on the batch that it is in.
     for i in range(episodes.size):
         h = hidden[episodes[i]]
-        x[i, :, N_CHANNELS:] = 0.0
+        x[i, :, N_FEATURES:] = 0.0
         for e in range(road.edges.shape[0]):
             start, end = road.edges[e, 0], road.edges[e, 1]
             for j in range(M):
-                x[i, end, N_CHANNELS + j] += h[start, j]
-                x[i, start, N_CHANNELS + M + j] += h[end, j]
+                x[i, end, N_FEATURES + j] += h[start, j]
+                x[i, start, N_FEATURES + M + j] += h[end, j]
         np.dot(x[i], weights.inputs, g)
         np.dot(h, weights.hidden, q)
         for s in range(S):
@@ -369,7 +369,7 @@ def advance(bundle: Bundle, episodes: IntArray, x: Float32Array) -> None:
 def _gate(
     g: Float32Array, q: Float32Array, g_bias: Float32Array, q_bias: Float32Array, h: Float32Array
 ) -> None:
-    """Move the hidden state of a cell."""
+    """Update the hidden state of a cell."""
     H = h.size
     for j in range(H):
         z = _HALF + _HALF * _tanh(_HALF * (g[j] + g_bias[j] + q[j] + q_bias[j]))
@@ -382,7 +382,7 @@ def _gate(
 
 @inline_part
 def _tanh(x: np.float32) -> np.float32:
-    """Return tanh to some 1e-7, as an expression that compiles to vector instructions.
+    """Return tanh to within some 1e-7, as an expression that compiles to vector instructions.
 
     Lambert's continued fraction at a quarter of the argument, and twice the formula of the double
     argument.
@@ -400,7 +400,7 @@ def _tanh(x: np.float32) -> np.float32:
 def _read_heads(
     raw: Float32Array, bias: Float32Array, unit: float, limit: float, out: FloatArray
 ) -> None:
-    """Write density, speed and their deviations."""
+    """Write density, speed and their deviations from the outputs of four heads."""
     out[0] = DENSITY_RANGE * unit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[0] + bias[0])))
     out[1] = SPEED_RANGE * limit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[1] + bias[1])))
     out[2] = unit * np.exp(clip(float(raw[2] + bias[2]), LOWEST_SPREAD, HIGHEST_SPREAD))

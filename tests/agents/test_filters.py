@@ -189,7 +189,7 @@ def steps(network, batch, n):
     hidden = torch.zeros(len(age), network.width)
     for t in range(n):
         with torch.no_grad():
-            hidden = network(batch.roads, batch.channels(t, predicted, age), hidden)
+            hidden = network(batch.roads, batch.features(t, predicted, age), hidden)
             present, ahead = network.read(batch.roads, hidden)
         predicted = ahead.numpy().astype(float)
         yield hidden.numpy(), present.numpy()

@@ -20,7 +20,7 @@ from dptse_env.estimators import (
 )
 from dptse_env.estimators.base import Estimator
 from dptse_env.estimators.recurrent import FORMAT, write_weights
-from dptse_env.estimators.recurrent_kernels import CHANNELS, Weights, shapes
+from dptse_env.estimators.recurrent_kernels import FEATURES, Weights, shapes
 from dptse_env.model import ARZModel, Channels, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY, Corridor, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -265,7 +265,7 @@ def card(**ranges):
     return {
         "name": "random",
         "format": FORMAT,
-        "channels": list(CHANNELS),
+        "channels": list(FEATURES),
         "ranges": {**RANGES, **ranges},
         "training": {"seed": 0},
     }

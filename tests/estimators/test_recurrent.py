@@ -40,8 +40,8 @@ def of_weights(episodes, folder, weights=None, **ranges):
 # Beside the network that is trained ---------------------------------------------------------------
 
 
-def channels(model, measured, inputs, prior, age):
-    """The channels and innovations of one episode, as the module's docstring has them.
+def features(model, measured, inputs, prior, age):
+    """The features and innovations of one episode, as the module's docstring has them.
 
     All rows and cells are treated at once.
 
@@ -123,7 +123,7 @@ class Twin:
     def step(self, inputs, given):
         """Return the estimates and deviations after a step, and before the next `(n, S, 4)`."""
         both = [
-            channels(self.model, [part[k : k + 1] for part in given], inputs[k], *prior)
+            features(self.model, [part[k : k + 1] for part in given], inputs[k], *prior)
             for k, prior in enumerate(zip(self.ahead, self.age, strict=True))
         ]
         x, self.innovations = (np.stack(each) for each in zip(*both, strict=True))
@@ -299,7 +299,7 @@ def test_damaged_files_are_refused(path, tmp_path):
         (lambda c, a: a.update(hidden=np.zeros((0, 0), "f4")), r"width must be in 1\.\.512, got 0"),
         (lambda c, a: a.update(hidden=np.array(1.0)), r"width must be in 1\.\.512, got 0"),
         (lambda c, a: c.update(format="recurrent-9"), "'recurrent-9', this version reads"),
-        (lambda c, a: c.update(channels=["queried"]), "channels of format"),
+        (lambda c, a: c.update(channels=["queried"]), "features of format"),
         (lambda c, a: c.update(ranges={"lanes": [1, "2"]}), "'lanes' must be two numbers"),
     ],
 )

@@ -135,4 +135,4 @@ OWN_ROADS: dict[str, Keywords] = {
 KEPT_BACK = (
     "segments of 200 m", "lane drop, 4 to 3", "drivers by IDM, 100 km/h", "no ramps, 90 km/h",
 )  # fmt: skip
-"""Roads on which nothing was chosen: they were played once, when the network was final."""
+"""Roads on which nothing was chosen: they were played once, when the weights were final."""

@@ -51,7 +51,7 @@ QUEUES: dict[str, tuple[int, ...]] = {
     ),
 }  # fmt: skip
 """Numbers of highways whose sections are played, by where they have a queue, as `queue_of` finds
-it. Networks are trained on highways of smaller numbers."""
+it. Weights are trained on highways of smaller numbers."""
 SEGMENTS, SECONDS = 9, 400
 """Segments of a section, and seconds of its record."""
 QUEUED, RARELY = 0.15, 0.02
