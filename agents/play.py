@@ -203,7 +203,7 @@ def record(
     Raises:
         ValueError: A seed is out of range or was not recorded.
         RecordingError: A recording fails, or the folder cannot be written.
-        NetworkError: The corridor has to be compiled and cannot be.
+        NetconvertError: The corridor has to be compiled and cannot be.
         SumoVersionError: libsumo is missing, broken or of another release series.
     """
     library: RecordLibrary = open_library(records)

@@ -23,7 +23,7 @@ from agents.study import Place
 from dptse_env.config import resolve
 from dptse_env.traffic import (
     Corridor,
-    NetworkError,
+    NetconvertError,
     RecordingError,
     RecordLibrary,
     SumoVersionError,
@@ -114,7 +114,7 @@ BAD_INPUT = (
 """Errors of what a program was given, which end it with status 2 and their message alone."""
 
 FAILURES = (
-    OSError, MissingExtraError, NetworkError, RecordingError, SumoVersionError, ExecutorError,
+    OSError, MissingExtraError, NetconvertError, RecordingError, SumoVersionError, ExecutorError,
     PlayError,
 )  # fmt: skip
 """Errors of a run, which end a program with status 1 and their message alone."""

@@ -15,7 +15,7 @@ GROUPS = {
     },
     "train": {
         "train": "train a query policy",
-        "train-estimator": "train a network as an estimator",
+        "train-estimator": "train the recurrent network",
         "tune": "tune the settings of estimators",
     },
     "compare": {

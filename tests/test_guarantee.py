@@ -217,7 +217,7 @@ def configuration(one_of):
     """A configuration of a short road, of choices that a function makes."""
     is_paced, adjacency = one_of(True, True, False), one_of("replace", "add_remove")
     sensors, estimator = one_of((), (1,), (5, 7), (0, 1, 6)), one_of(*ESTIMATORS)
-    # The network was trained on a limit of 102 km/h, and on sums over two segments at most.
+    # The weights were trained on a limit of 102 km/h, and on sums over two segments at most.
     limit, span = (102.0, 2) if estimator == "recurrent" else (one_of(102.0, 100.7), 3)
     given = {
         "epsilon": one_of(0.5, 5.0, 20.0),

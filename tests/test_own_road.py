@@ -77,7 +77,7 @@ def test_a_count_scatters_less_in_density_on_a_longer_segment():
     )
 
 
-def test_a_network_on_a_road_unlike_those_it_was_trained_on_says_so(road_file):
+def test_weights_on_a_road_unlike_those_of_their_training_are_named(road_file):
     name = "estimator_settings.recurrent.weights"
     with pytest.warns(UserWarning, match=f"{name}: values measured or tuned on"):
         env = gym.make(ID, corridor=road_file, traffic_seeds=[0], estimator="recurrent")

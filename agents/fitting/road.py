@@ -31,7 +31,7 @@ from dptse_env.traffic import (
     write_corridor,
 )
 from dptse_env.traffic.imported import has_vehicles, recorded_seeds
-from dptse_env.traffic.sumo_input import network_xml
+from dptse_env.traffic.sumo_input import net_xml
 from dptse_env.utils.units import HOUR
 from dptse_env.utils.validation import read_json, require
 from dptse_env.versions import code_version
@@ -152,7 +152,7 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
         ValueError: The file, a keyword or a seed is out of range, or the road cannot be fitted; the
             message starts with a path and says what to change.
         MissingExtraError: netconvert is missing.
-        NetworkError: netconvert refuses the road.
+        NetconvertError: netconvert refuses the road.
     """
     require(is_road_file(path), "road", "a road file, whose name ends in .toml", str(path))
     road = read_road(path)
@@ -197,13 +197,11 @@ def _lies_in(value: Any, folder: Path) -> bool:
 
 
 def _check_road(path: Path, corridor: Corridor) -> None:
-    """Refuse a road without traffic or network, and segments that suit no set of parameters."""
+    """Refuse a road without traffic or SUMO files, and segments that suit no set of parameters."""
     if corridor.source.recordings is None and corridor.source.sumo is None:
         rates = [rate for _, rate in corridor.conditions.published_demand.mainline]
         require(max(rates) > 0.0, f"{path}: demand.mainline", "above 0 veh/h at some time", rates)
-        network_xml(
-            corridor.geometry
-        )  # so that netconvert refuses the road, or is missing, at once
+        net_xml(corridor.geometry)  # so that netconvert refuses the road, or is missing, at once
     pairs = zip(corridor.geometry.segment_lengths, corridor.geometry.speed_limits, strict=True)
     for segment, (length, limit) in enumerate(pairs):
         least = LARGEST_W * limit / HOUR

@@ -32,7 +32,7 @@ from dptse_env.traffic.roads import (
 )
 from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
-from dptse_env.traffic.sumo_input import NetworkError
+from dptse_env.traffic.sumo_input import NetconvertError
 
 __all__ = [
     "CORRIDORS",
@@ -49,7 +49,7 @@ __all__ = [
     "Incident",
     "IncidentDistribution",
     "InvalidRecordError",
-    "NetworkError",
+    "NetconvertError",
     "Penetration",
     "Record",
     "RecordLibrary",

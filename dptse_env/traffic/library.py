@@ -32,7 +32,7 @@ from dptse_env.traffic.own_sumo import WARNING
 from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
 from dptse_env.traffic.recording import record_seeds
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, sumo_version
-from dptse_env.traffic.sumo_input import NetworkError
+from dptse_env.traffic.sumo_input import NetconvertError
 from dptse_env.utils.files import require_writable
 from dptse_env.utils.threads import n_cores
 from dptse_env.utils.units import HOUR
@@ -100,7 +100,7 @@ class RecordLibrary:
             ValueError: The seed is negative or no integer, or was not recorded.
             InvalidRecordError: A record of the corridor's recordings is damaged or exchanged.
             RecordingError: The record cannot be made; the message names the library and the seed.
-            NetworkError: The corridor has to be compiled and cannot be.
+            NetconvertError: The corridor has to be compiled and cannot be.
             SumoVersionError: libsumo is missing, broken or of another release series.
         """
         seed = integer("traffic seed", seed, 0)
@@ -144,7 +144,7 @@ class RecordLibrary:
             ValueError: A seed or the number of workers is out of range, or a seed was not recorded.
             RecordingError: A recording fails; the message names its seed and the number of records
                 in the library. Recordings in progress are finished and kept, no other is started.
-            NetworkError: The corridor has to be compiled and cannot be.
+            NetconvertError: The corridor has to be compiled and cannot be.
             SumoVersionError: libsumo is missing, broken or of another release series.
         """
         n_workers = n_cores() if workers is None else integer("workers", workers, 1)
@@ -225,7 +225,7 @@ class RecordLibrary:
         wanted = f"the {len(seeds)} requested record(s) of {corridor.name}"
         try:
             yield
-        except (RecordingError, NetworkError, SumoVersionError) as error:
+        except (RecordingError, NetconvertError, SumoVersionError) as error:
             try:
                 n_held = len(seeds) - len(self.missing(corridor, seeds))
             except SumoVersionError:  # its release is part of every record's path

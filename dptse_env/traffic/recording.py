@@ -29,7 +29,7 @@ from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.own_sumo import Remark
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
-from dptse_env.traffic.sumo_input import NetworkError
+from dptse_env.traffic.sumo_input import NetconvertError
 from dptse_env.utils.registry import MissingExtraError
 
 ATTEMPTS = 3
@@ -66,7 +66,7 @@ def record_seeds(
     Raises:
         RecordingError: A recording fails, or `ATTEMPTS` workers died on a seed. Recordings in
             progress are finished and kept, no other is started.
-        NetworkError: The corridor has to be compiled and cannot be.
+        NetconvertError: The corridor has to be compiled and cannot be.
         SumoVersionError: libsumo is missing, broken or of another release series.
         MissingExtraError: The corridor has to be compiled and netconvert is missing.
     """
@@ -203,7 +203,7 @@ def _record(corridor: Corridor, seed: int, path: Path, source: dict[str, object]
     remarks: list[str] = []
     try:
         simulate(corridor, seed, remarks.append).save(path, source)
-    except (RecordingError, NetworkError, SumoVersionError, MissingExtraError):
+    except (RecordingError, NetconvertError, SumoVersionError, MissingExtraError):
         raise
     except Exception as error:
         cause = f"{type(error).__name__}: {error}"

@@ -96,7 +96,7 @@ LONG_HIGHWAY = Corridor(
 """A 12 km stretch with four interchanges; demand level and two incidents vary with the seed."""
 
 SHIPPED_CORRIDORS = (PAPER_HIGHWAY, SHORT_HIGHWAY, LONG_HIGHWAY)
-"""Corridors whose compiled networks come with the package."""
+"""Corridors whose compiled nets come with the package."""
 
 CORRIDORS = Registry(
     "corridor",

@@ -30,7 +30,7 @@ from dptse_env.traffic.demand import Incident, lowest_limit
 from dptse_env.traffic.own_sumo import KMH, WARNING, Remark
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import Scenario, draw_scenario
-from dptse_env.traffic.sumo_input import LONGEST_OUTPUT, edge_ids, network_xml, routes_xml
+from dptse_env.traffic.sumo_input import LONGEST_OUTPUT, edge_ids, net_xml, routes_xml
 
 SUPPORTED_SUMO = "1.28"
 """Release series that records are made with: others simulate the same scenario differently."""
@@ -106,7 +106,7 @@ def simulate(corridor: Corridor, seed: int, remark: Remark = lambda text: None) 
     Raises:
         RecordingError: SUMO fails, the corridor's own files are missing or changed, or libsumo
             already holds a simulation in this process, which is left unchanged.
-        NetworkError: The corridor has to be compiled and cannot be.
+        NetconvertError: The corridor has to be compiled and cannot be.
         SumoVersionError: libsumo is missing, broken or of another release series.
     """
     scenario = draw_scenario(corridor, seed)
@@ -139,7 +139,7 @@ def running(
     if corridor.source.recordings is not None:
         cause = "its traffic is recorded, not simulated"
         raise RecordingError.from_cause(corridor, scenario.seed, cause)
-    network = network_xml(corridor.geometry) if corridor.source.sumo is None else ""
+    net = net_xml(corridor.geometry) if corridor.source.sumo is None else ""
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
         libsumo = _import_libsumo()
         if libsumo.isLoaded():
@@ -149,7 +149,7 @@ def running(
         messages = folder / "messages.txt"
         messages.touch()
         try:
-            command = [*_command(folder, network, corridor, scenario), *QUIET]
+            command = [*_command(folder, net, corridor, scenario), *QUIET]
             # Names in the folder are plain ASCII: SUMO opens no others where the locale is C.
             with contextlib.chdir(folder), _stderr_to(messages):
                 try:
@@ -260,14 +260,14 @@ def _stderr_to(path: Path) -> Iterator[None]:
         os.close(original)
 
 
-def _command(folder: Path, network: str, corridor: Corridor, scenario: Scenario) -> list[str]:
+def _command(folder: Path, net: str, corridor: Corridor, scenario: Scenario) -> list[str]:
     """Write SUMO's input files and return its command line."""
     if corridor.source.sumo is not None:
         return own_sumo.command(folder, corridor.source.sumo, scenario.sumo_seed, scenario.scale)
-    network_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
-    network_file.write_text(network, encoding="utf-8")
+    net_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
+    net_file.write_text(net, encoding="utf-8")
     route_file.write_text(routes_xml(corridor, scenario), encoding="utf-8")
-    files = ["-n", network_file.name, "-r", route_file.name]
+    files = ["-n", net_file.name, "-r", route_file.name]
     return ["sumo", *files, "--seed", str(scenario.sumo_seed), *OPTIONS]
 
 

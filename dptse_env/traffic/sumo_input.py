@@ -1,8 +1,8 @@
-"""SUMO's input for a corridor: a network with one edge per segment, and vehicles with routes.
+"""SUMO's input for a corridor: a net with one edge for each segment, and vehicles with routes.
 
-The networks of the package's corridors come with it; any other geometry is compiled by netconvert
-on demand, which needs `eclipse-sumo` (extra ``corridors``). ``networks/NAME.net.xml`` is
-``compile_network(CORRIDORS[NAME].geometry)``.
+The nets of the package's corridors come with it. netconvert compiles any other geometry on demand,
+which needs `eclipse-sumo` (extra ``corridors``). ``nets/NAME.net.xml`` is
+``compile_net(CORRIDORS[NAME].geometry)``.
 
 Every edge declares the nominal length of its segment, and the recording runs with SUMO's internal
 links switched off: every vehicle is then on exactly one segment.
@@ -44,8 +44,8 @@ Point = tuple[float, float]
 """Coordinates [m]."""
 
 
-class NetworkError(RuntimeError):
-    """A network cannot be compiled: netconvert refused it."""
+class NetconvertError(RuntimeError):
+    """netconvert refused to compile the net of a road."""
 
 
 def edge_ids(geometry: Geometry) -> tuple[str, ...]:
@@ -68,41 +68,41 @@ def ramp_edges(name: str, segments: Sequence[int]) -> tuple[str, ...]:
     return tuple(f"{name}_{k}" for k in range(len(segments))) if several else (name,)
 
 
-def network_xml(geometry: Geometry) -> str:
-    """Return the compiled network of a road: the packaged one, else a fresh compilation.
+def net_xml(geometry: Geometry) -> str:
+    """Return the compiled net of a road: the packaged one, else a fresh compilation.
 
     Raises:
         MissingExtraError: The geometry is not that of a preset, and netconvert is missing.
-        NetworkError: netconvert fails.
+        NetconvertError: netconvert fails.
     """
     described = _plain_xml(geometry)
     for preset in SHIPPED_CORRIDORS:
         if _plain_xml(preset.geometry) == described:
-            return packaged_network(preset.name)
-    return compile_network(geometry)
+            return packaged_net(preset.name)
+    return compile_net(geometry)
 
 
 @lru_cache
-def packaged_network(name: str) -> str:
-    """Read the compiled network of the preset `name` from the package."""
-    resource = resources.files("dptse_env.traffic") / "networks" / f"{name}.net.xml"
+def packaged_net(name: str) -> str:
+    """Read the compiled net of the preset `name` from the package."""
+    resource = resources.files("dptse_env.traffic") / "nets" / f"{name}.net.xml"
     return resource.read_text(encoding="utf-8")
 
 
 @lru_cache
-def compile_network(geometry: Geometry) -> str:
-    """Compile a network with netconvert.
+def compile_net(geometry: Geometry) -> str:
+    """Compile a net with netconvert.
 
     Returns:
-        The network's XML, without the comment that holds netconvert's time and paths, so that the
+        The XML of the net, without the comment that holds netconvert's time and paths, so that the
         same geometry always gives the same text.
 
     Raises:
         MissingExtraError: `eclipse-sumo` is not installed.
-        NetworkError: netconvert fails.
+        NetconvertError: netconvert fails.
     """
     command = [str(_netconvert()), *NETCONVERT_OPTIONS]
-    with tempfile.TemporaryDirectory(prefix="dptse-network-") as directory:
+    with tempfile.TemporaryDirectory(prefix="dptse-net-") as directory:
         folder = Path(directory)
         for option, suffix, text in zip(
             ("-n", "-e", "-x"), ("nod", "edg", "con"), _plain_xml(geometry), strict=True
@@ -116,9 +116,9 @@ def compile_network(geometry: Geometry) -> str:
         )
         if result.returncode != 0:
             said = result.stderr.strip()[:LONGEST_OUTPUT]
-            raise NetworkError(f"netconvert refused {str(geometry)[:LONGEST_OUTPUT]}:\n{said}")
-        network = output.read_text(encoding="utf-8")
-    return re.sub(r"<!--.*?-->\s*", "", network, flags=re.DOTALL)
+            raise NetconvertError(f"netconvert refused {str(geometry)[:LONGEST_OUTPUT]}:\n{said}")
+        net = output.read_text(encoding="utf-8")
+    return re.sub(r"<!--.*?-->\s*", "", net, flags=re.DOTALL)
 
 
 def _netconvert() -> Path:
@@ -162,7 +162,7 @@ def _plain_xml(geometry: Geometry) -> list[str]:
 
 
 class _PlainXML:
-    """Nodes, edges and connections of a network, as netconvert reads them."""
+    """Nodes, edges and connections of a net, as netconvert reads them."""
 
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
@@ -227,7 +227,7 @@ class _PlainXML:
 
 
 def routes_xml(corridor: Corridor, scenario: Scenario) -> str:
-    """Return SUMO's route file of a scenario, on the network that is made for its corridor."""
+    """Return SUMO's route file of a scenario, on the net that is made for its corridor."""
     road, drivers = corridor.geometry, corridor.conditions.drivers
     classes = {
         each.name: each.attributes(drivers) for each in corridor.conditions.vehicle_classes

@@ -184,7 +184,7 @@ class Seen:
 
 
 def steps(network, batch, n):
-    """Yield hidden states and what the network says of the second, for `n` seconds."""
+    """Yield hidden states and the estimates of the second, for `n` seconds."""
     age, predicted = np.full(len(batch.start), LONGEST_AGE), batch.start
     hidden = torch.zeros(len(age), network.width)
     for t in range(n):

@@ -150,7 +150,7 @@ def test_an_id_says_all_that_rows_depend_on(tmp_path):
         ids |= {replace(first, **change).id for change in there}
     assert len(ids) == 4
     assert not any(str(tmp_path) in each for each in ids if "corridor" in each)
-    # A network of the package by its own name goes with its digest.
+    # Weights of the package by their own name go with their digest.
     keywords = {"estimator_settings": {"recurrent": {"weights": "highway-flows"}}}
     assert read_weights("highway-flows").card["sha256"] in replace(first, keywords=keywords).id
 

@@ -87,12 +87,12 @@ class Oracle:
     """
 
     def __init__(self, road, parameters, time_step=1.0):
-        network = road.geometry
+        geometry = road.geometry
         per_lane = parameters.jam_density / parameters.lanes
-        self.network, self.v_f, self.gamma = network, parameters.free_flow_speed, parameters.gamma
-        self.jam = per_lane * np.array(network.segment_lanes)
+        self.geometry, self.v_f, self.gamma = geometry, parameters.free_flow_speed, parameters.gamma
+        self.jam = per_lane * np.array(geometry.segment_lanes)
         self.outer_jam = per_lane * road.road.lanes[self.jam.size :]
-        self.ratio = time_step / 3600.0 / np.array(network.segment_lengths)
+        self.ratio = time_step / 3600.0 / np.array(geometry.segment_lengths)
         self.pull = time_step / parameters.relaxation_time
 
     # Relations: p, sigma, q_max, D and S.
@@ -130,7 +130,7 @@ class Oracle:
 
     def flows(self, states, inputs):
         """w and q [veh/h] of all cells, q from a cell to another, and q and w into each entry."""
-        road, jam, outer, u = self.network, self.jam, self.outer_jam, inputs.T
+        road, jam, outer, u = self.geometry, self.jam, self.outer_jam, inputs.T
         w, v, D = self.cells(states)
         q, passing, source, n_on = np.empty_like(D), {}, {}, len(road.on_ramps)
         junctions = {*road.on_ramps, *road.off_ramps}

@@ -155,11 +155,11 @@ def test_a_simulation_of_the_user_survives(short_record, tmp_path):
     """libsumo holds one simulation per process; the user's own must not be replaced."""
     import libsumo
 
-    from dptse_env.traffic.sumo_input import packaged_network
+    from dptse_env.traffic.sumo_input import packaged_net
 
-    network = tmp_path / "users.net.xml"
-    network.write_text(packaged_network("paper-highway"))
-    libsumo.start(["sumo", "-n", str(network), "--no-step-log", "--xml-validation.net", "never"])
+    net = tmp_path / "users.net.xml"
+    net.write_text(packaged_net("paper-highway"))
+    libsumo.start(["sumo", "-n", str(net), "--no-step-log", "--xml-validation.net", "never"])
     try:
         libsumo.simulationStep()
         with pytest.raises(RecordingError, match="another simulation in this process"):

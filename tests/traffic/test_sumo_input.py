@@ -1,4 +1,4 @@
-"""Networks for SUMO: those that come with the package, and compiled ones."""
+"""Nets for SUMO: those that come with the package, and compiled ones."""
 
 import importlib.util
 import re
@@ -7,10 +7,10 @@ import pytest
 
 from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY
 from dptse_env.traffic.sumo_input import (
-    compile_network,
+    compile_net,
     edge_ids,
-    network_xml,
-    packaged_network,
+    net_xml,
+    packaged_net,
 )
 from dptse_env.utils.registry import MissingExtraError
 from tests.helpers import UNEVEN
@@ -22,14 +22,14 @@ needs_netconvert = pytest.mark.skipif(
 
 @needs_netconvert
 @pytest.mark.parametrize("name", CORRIDORS)
-def test_packaged_networks_are_what_netconvert_makes_of_the_presets(name):
-    assert compile_network(CORRIDORS[name].geometry) == packaged_network(name)
+def test_packaged_nets_are_what_netconvert_makes_of_the_presets(name):
+    assert compile_net(CORRIDORS[name].geometry) == packaged_net(name)
 
 
 def test_a_preset_is_not_compiled(monkeypatch):
-    monkeypatch.setattr("dptse_env.traffic.sumo_input.compile_network", None)
+    monkeypatch.setattr("dptse_env.traffic.sumo_input.compile_net", None)
     changed = PAPER_HIGHWAY.replaced(name="mine", incident=None, duration=60)
-    assert network_xml(changed.geometry) == packaged_network("paper-highway")
+    assert net_xml(changed.geometry) == packaged_net("paper-highway")
 
 
 def test_a_missing_netconvert_names_the_extra(monkeypatch):
@@ -40,12 +40,12 @@ def test_a_missing_netconvert_names_the_extra(monkeypatch):
 
     monkeypatch.setattr(importlib.util, "find_spec", without_sumo)
     with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[corridors\]'"):
-        compile_network(PAPER_HIGHWAY.replaced(n_mainline=21).geometry)
+        compile_net(PAPER_HIGHWAY.replaced(n_mainline=21).geometry)
 
 
-def test_the_network_has_the_lengths_lanes_and_limits_of_the_corridor():
+def test_the_net_has_the_lengths_lanes_and_limits_of_the_corridor():
     road, arrays = UNEVEN.geometry, UNEVEN.road
-    text = network_xml(road)
+    text = net_xml(road)
     columns = arrays.lengths, arrays.lanes, arrays.limits
     for edge, length, count, limit in zip(edge_ids(road), *columns, strict=True):
         found = re.findall(

@@ -16,7 +16,7 @@ from dptse_env.utils.registry import MissingExtraError
 
 SHORT = ["--env", "dptse_env:dptse/ShortHighway-v0"]
 LONGER = {"n_mainline": 7}
-"""A corridor whose network does not come with the package."""
+"""A corridor whose net does not come with the package."""
 
 WITHOUT_EXTRAS = {
     "train": [[], ["--version"], ["info"], ["evaluate", "--help"], ["import", "network"]],
@@ -81,7 +81,7 @@ def lacks(package: str) -> list[tuple[str, str]]:
 
 
 def check_corridor() -> None:
-    """Make an environment on a road whose network has to be compiled."""
+    """Make an environment on a road whose net has to be compiled."""
     env = gym.make("dptse_env:dptse/ShortHighway-v0", corridor=LONGER, bandwidth=1)
     said = ""
     try:

@@ -29,7 +29,7 @@ from dptse_env.traffic import (
 )
 from dptse_env.traffic.own_sumo import TRAFFIC, copy_input
 from dptse_env.traffic.sumo import running, seconds
-from dptse_env.traffic.sumo_input import packaged_network
+from dptse_env.traffic.sumo_input import packaged_net
 from dptse_env.utils.files import file_digest
 from tests.helpers import ROOT
 from tests.importers.sumo_net.conftest import FLOWS, PATH
@@ -112,11 +112,11 @@ def test_vehicles_pass_from_segment_to_segment_without_gaps(road):
     }
 
 
-def test_the_record_is_that_of_the_generated_network_if_the_files_are_the_same(tmp_path):
+def test_the_record_is_that_of_the_generated_net_if_the_files_are_the_same(tmp_path):
     calm = SHORT_HIGHWAY.replaced(incident=None)
     scenario = draw_scenario(calm, 3)
     net, routes = tmp_path / "short.net.xml", tmp_path / "short.rou.xml"
-    net.write_text(packaged_network("short-highway"))
+    net.write_text(packaged_net("short-highway"))
     routes.write_bytes(ElementTree.tostring(_vehicles(calm, scenario)))
     files = Files(
         net,
@@ -138,7 +138,7 @@ def test_the_record_is_that_of_the_generated_network_if_the_files_are_the_same(t
 
 
 def _vehicles(corridor, scenario):
-    """Write a scenario of a generated network as SUMO's routes."""
+    """Write a scenario of a generated net as SUMO's routes."""
     root = ElementTree.Element("routes")
     ElementTree.SubElement(root, "vType", {"id": "car", **corridor.conditions.drivers.attributes()})
     for i, origin in enumerate(scenario.origins):
