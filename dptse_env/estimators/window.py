@@ -506,7 +506,7 @@ def minimise(
     if _find_active_set(road, channels, window, factor, diagonal, active_set, current, trial):
         copy_matrix(trial.z, z)
         return ACTIVE_SET
-    if _projected_newton(road, channels, window, factor, diagonal, active_set, current, trial, z):
+    if _projected_newton(road, channels, window, factor, diagonal, active_set, current, z):
         return NEWTON
     return UNSOLVED
 
@@ -599,7 +599,6 @@ def _projected_newton(
     diagonal: FloatArray,
     active_set: IntArray,
     current: Iterate,
-    trial: Iterate,
     z: FloatArray,
 ) -> bool:
     """Minimise from an iterate within bounds by projected Newton steps; return success.
@@ -611,6 +610,7 @@ def _projected_newton(
     """
     lower, upper, step = window.lower, window.upper, np.empty(z.shape)
     residual = _natural_residual(lower, upper, diagonal, current)
+    trial = make_iterate(z.shape[0], z.shape[1], channels.first.size)
     for _ in range(NEWTON_ROUNDS):
         if residual <= REFINED:
             break

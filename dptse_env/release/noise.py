@@ -215,11 +215,9 @@ class Noise:
         given, self._given = self._given, None
         if given is not None:
             self._normal[episodes, self._next[episodes]] = given[episodes]
-        released, open_ = np.empty(values.shape), np.empty(values.shape, dtype=np.bool_)
-        n_open = _add(
-            self._normal, self._next, episodes, values, self._scale, sigma, unit, DOUBT, released,
-            open_,
-        )  # fmt: skip
+        released, open_, n_open = _add(
+            self._normal, self._next, episodes, values, self._scale, sigma, unit, DOUBT
+        )
         if n_open < 0:
             raise ValueError(
                 "privacy.epsilon must be such that noise has standard deviations in "
@@ -308,18 +306,17 @@ def _add(
     sigma: FloatArray,
     unit: FloatArray,
     doubt: float,
-    released: FloatArray,
-    open_: BoolArray,
-) -> int:
-    """Write releases, and which of them double precision leaves open; return how many.
+) -> tuple[FloatArray, BoolArray, int]:
+    """Return releases, flags of those that double precision leaves open, and their number.
 
     That is negative, and nothing is done, where a deviation is out of range.
     """
+    released, open_ = np.empty(values.shape), np.empty(values.shape, dtype=np.bool_)
     for k in range(episodes.size):
         for c in range(unit.size):
             for q in range(2):
                 if not 0.0 < sigma[k, c, q] <= LARGEST_SIGMA:
-                    return -1
+                    return released, open_, -1
     n_open = 0
     for k in range(episodes.size):
         step = next_[episodes[k]]
@@ -336,4 +333,4 @@ def _add(
                 open_[k, c, q] = is_open
                 n_open += is_open
                 released[k, c, q] = (np.rint(values[k, c, q] / grid) + steps) * grid / unit[c]
-    return n_open
+    return released, open_, n_open

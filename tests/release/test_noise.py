@@ -66,8 +66,8 @@ def smoothed(block):
 FAULTS = {
     "stated deviation in quantity density": lambda block: block * [0.95, 1.0],
     "stated deviation in quantity speed": lambda block: block * [1.0, 0.95],
-    "0 columns and 1 quantities further, 0 s later": lambda block: block[..., [0, 0]],
-    "0 columns and 0 quantities further, 1 s later": smoothed,
+    "0 channels and 1 quantities further, 0 s later": lambda block: block[..., [0, 0]],
+    "0 channels and 0 quantities further, 1 s later": smoothed,
     f"{BLOCK} s later": lambda block: np.random.default_rng(1).normal(size=block.shape),
     None: lambda block: block,
 }
