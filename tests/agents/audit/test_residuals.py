@@ -100,7 +100,7 @@ def copied(channel, source, lag, sign=1.0):
 
 FAULTS = {
     "0.000 times the stated deviation in second 77": lambda r: r * part(77, 0, 0.0),
-    "times the stated deviation in column 3": lambda r: r * part(3, 1, 0.7),
+    "times the stated deviation in channel 3": lambda r: r * part(3, 1, 0.7),
     "many numbers below ": lambda r: np.sqrt(3.0) * (2.0 * ndtr(r) - 1.0),
     " of the density of channel 1 and the speed of channel 4, 7 s later": (
         lambda r: r * 0.0 + copied((1, 0), (4, 1), 7)
