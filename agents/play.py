@@ -47,7 +47,7 @@ class Cell:
     """
 
     env: str
-    policy: str = "paper"
+    policy: str = "shift-ahead"
     keywords: Mapping[str, Any] = field(default_factory=dict)
     labels: Mapping[str, Any] = field(default_factory=dict)
     noise_seed: int = 0

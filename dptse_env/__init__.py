@@ -9,7 +9,7 @@ Importing the package registers its environments with Gymnasium::
 The module prefix makes the id known in subprocesses too. `evaluate` plays whole episodes of a
 query policy::
 
-    rows = dptse_env.evaluate(env, "paper", seeds=range(64))
+    rows = dptse_env.evaluate(env, "shift-ahead", seeds=range(64))
 """
 
 from typing import TYPE_CHECKING, Any

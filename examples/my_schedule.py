@@ -32,7 +32,7 @@ def main() -> None:
     env = gym.make_vec(
         "dptse/ShortHighway-v0", num_envs=len(SEEDS), traffic_seeds=list(SEEDS), bandwidth=1
     )
-    for schedule in ("paper", "round-robin", "oldest-first", "speed-front", DenseAndOld):
+    for schedule in ("shift-ahead", "round-robin", "oldest-first", "speed-front", DenseAndOld):
         rows = dptse_env.evaluate(env, schedule, SEEDS)
         errors = [-1000 * row["reward"] for row in rows]
         name = schedule if isinstance(schedule, str) else schedule.__name__

@@ -29,7 +29,7 @@ class Args(Machines, Environment):
     """Vehicle that differs: worst-case, opposite, replaced or deleted; or climbed, the worst
     one that a search from random trips and queries finds."""
     policy: str = "hunter"
-    """Queries: hunter, or a public schedule (paper, static, round-robin)."""
+    """Queries: hunter, or a public schedule (shift-ahead, static, round-robin)."""
     runs: int = 5000
     """Runs in each of the two worlds."""
     rounds: int = 100

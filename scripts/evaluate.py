@@ -1,7 +1,7 @@
 r"""Compare query schedules and policies on the same traffic and noise.
 
 dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --seeds 2000:2004 \
-    --schedules paper round-robin
+    --schedules shift-ahead round-robin
 
 The error is minus 1,000 times the reward. Differences are paired by traffic and noise.
 """

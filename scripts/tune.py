@@ -41,7 +41,7 @@ class Args(Recording):
     """Traffic seeds, first:stop; training seeds only."""
     trials: int = 60
     """Trials of each search, those of earlier runs included."""
-    schedule: str = "paper"
+    schedule: str = "shift-ahead"
     """Query schedule, or a saved policy: its .safetensors file or shipped name."""
     also: tuple[Extra, ...] = ()
     """Settings to search beside the usual ones; 'demand' are demand states with their noise."""

@@ -53,7 +53,7 @@ ROADS: dict[str, tuple[str, dict[str, Any]]] = {
 
 IDS = ("PaperHighway-v0", "PrivateHighway-v1", "ShortHighway-v0", "LongHighway-v0")
 SCHEDULES = (
-    "static", "paper", "round-robin", "random", "oldest-first", "largest-variance",
+    "static", "shift-ahead", "round-robin", "random", "oldest-first", "largest-variance",
     "largest-density-variance", "stale-variance", "largest-deviation", "speed-front", "none",
     "expected-reduction", "greedy-trace", "oracle-error", "oracle-gain",
 )  # fmt: skip
@@ -118,7 +118,7 @@ def recorded_steps(road: str) -> Numbers:
     """Return a state, and the inputs and releases of the `STEPS` seconds that follow it."""
     name, keywords = ROADS[road]
     env = _make(name, **keywords)
-    schedule, process = make_schedule("paper", env), env.unwrapped.process
+    schedule, process = make_schedule("shift-ahead", env), env.unwrapped.process
     observation, _ = env.reset(seed=0, options={"traffic_seed": 0})
     state = None
     witness = _Witness(process.estimator)
@@ -172,7 +172,7 @@ def _projected(rows: list[FloatArray]) -> FloatArray:
 def observations(name: str) -> Numbers:
     """Return what an id gives over `SECONDS` with the paper's schedule."""
     env = _make(name)
-    schedule = make_schedule("paper", env)
+    schedule = make_schedule("shift-ahead", env)
     observation, info = env.reset(seed=11)
     rows, rewards, spent, state = [observation], [], [info["spent_mu"]], None
     for _ in range(SECONDS):
@@ -244,7 +244,7 @@ def mean_errors(name: str, estimator: str) -> Numbers:
         env = gym.make_vec(
             ID.format(name), num_envs=len(SEEDS), estimator=estimator, traffic_seeds=list(SEEDS)
         )
-    rows = evaluate(env, "paper", list(SEEDS))
+    rows = evaluate(env, "shift-ahead", list(SEEDS))
     errors = [[row["rmse_density"], row["rmse_speed"]] for row in rows]
     return {"errors": np.array(errors).mean(axis=0)}
 

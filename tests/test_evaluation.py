@@ -31,7 +31,7 @@ def assert_same_rows(policy, seeds, keywords, **more):
 
 
 SCHEDULES = {*OBSERVATION_SCHEDULES, *PROCESS_SCHEDULES, *ORACLES} - {"random", "all"}
-FAST = ("paper", "speed-front", "greedy-trace", "oracle-error")
+FAST = ("shift-ahead", "speed-front", "greedy-trace", "oracle-error")
 
 
 @pytest.mark.parametrize("name", fast_and_slow(sorted(SCHEDULES), FAST))
@@ -40,7 +40,7 @@ def test_a_batch_gives_the_rows_of_one_episode_after_another(name):
 
 
 def test_seeds_need_not_fill_the_last_batch_and_episodes_may_start_late():
-    assert_same_rows(lambda env: "paper", (0, 1, 2), {**FAST_ONES, "random_start": True})
+    assert_same_rows(lambda env: "shift-ahead", (0, 1, 2), {**FAST_ONES, "random_start": True})
 
 
 class Learned:
@@ -74,8 +74,8 @@ def test_a_batch_gives_the_rows_of_a_learned_policy(action, deterministic):
 
 
 def test_the_baseline_is_evaluated_by_its_name():
-    rows = dptse_env.evaluate(make_env(), "paper", seeds=range(2))
-    assert rows == evaluate(make_env(), make_schedule("paper", make_env()), [0, 1])
+    rows = dptse_env.evaluate(make_env(), "shift-ahead", seeds=range(2))
+    assert rows == evaluate(make_env(), make_schedule("shift-ahead", make_env()), [0, 1])
     assert 0 < rows[0]["rmse_density"] < 60
 
 
@@ -96,7 +96,7 @@ class Noting:
 
 def test_errors_are_pooled_over_segments_and_seconds():
     noted = []
-    (row,) = evaluate(make_env(), "paper", [1], 2, watchers=[lambda p: Noting(p, noted)])
+    (row,) = evaluate(make_env(), "shift-ahead", [1], 2, watchers=[lambda p: Noting(p, noted)])
     assert row["n_seconds"] == 241
     counted = noted[61:]  # the first is the state at the reset
     truth, density, speed = (np.array(part)[:, 0] for part in zip(*counted, strict=True))
@@ -137,4 +137,4 @@ def test_a_seed_gives_the_same_noise_under_every_policy_and_another_with_a_noise
 )
 def test_what_cannot_be_evaluated_is_refused(env, seeds, message):
     with pytest.raises((ValueError, TypeError), match=message):
-        evaluate(env(), "paper", seeds)
+        evaluate(env(), "shift-ahead", seeds)

@@ -21,7 +21,7 @@ from dptse_env.utils.validation import require
 KINDS = ("worst-case", "opposite", "replaced", "deleted")
 """Kinds of targets; see `Planner.choose`."""
 
-PUBLIC_SCHEDULES = ("paper", "static", "round-robin")
+PUBLIC_SCHEDULES = ("shift-ahead", "static", "round-robin")
 """Schedules that ignore observations: their queries are known beforehand."""
 
 POLICIES = ("hunter", *PUBLIC_SCHEDULES)

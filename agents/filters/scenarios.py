@@ -23,7 +23,7 @@ MECHANISMS: dict[Kind, tuple[str, ...]] = {
 }  # fmt: skip
 """Release models of scenarios."""
 SCHEDULES = (
-    "round-robin", "paper", "random", "oldest-first", "static", "stale-variance",
+    "round-robin", "shift-ahead", "random", "oldest-first", "static", "stale-variance",
     "largest-variance", "largest-deviation", "expected-reduction",
 )  # fmt: skip
 """Query policies of scenarios; the last four follow the estimator's own deviations."""

@@ -30,7 +30,7 @@ ESTIMATORS_TRIED = (
 """Estimators among which a fit chooses: all that take less than a millisecond a second."""
 
 RULES_TRIED = (
-    ROUND_ROBIN, "paper", "oldest-first", "largest-variance", "stale-variance",
+    ROUND_ROBIN, "shift-ahead", "oldest-first", "largest-variance", "stale-variance",
     "largest-deviation", "speed-front", "expected-reduction",
 )  # fmt: skip
 """Query rules among which it chooses."""

@@ -80,7 +80,7 @@ class Search:
     env: str
     estimator: str
     seeds: str
-    schedule: str = "paper"
+    schedule: str = "shift-ahead"
     also: tuple[Extra, ...] = ()
     variant: str = ""
     seed: int = 0

@@ -63,7 +63,7 @@ from dptse_env.rendering import History
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.versions import code_version
 
-ENV, SCHEDULE = "dptse_env:dptse/PaperHighway-v0", "paper"
+ENV, SCHEDULE = "dptse_env:dptse/PaperHighway-v0", "shift-ahead"
 SEEDS = tuple(range(2000, 2020))
 PAPER_ESTIMATORS = ("ekf", "ukf", "enkf", "mhe")
 """The paper's estimators, in its order."""

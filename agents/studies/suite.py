@@ -123,7 +123,7 @@ CELLS = {
 """Environments with their traffic seeds, by name; the policy is another one each time."""
 
 RULES = (
-    "paper", "static", "random", "oldest-first", "largest-variance", "stale-variance",
+    "shift-ahead", "static", "random", "oldest-first", "largest-variance", "stale-variance",
     "largest-deviation", "expected-reduction", "speed-front", ZERO,
 )  # fmt: skip
 """Schedules that do without the truth."""

@@ -38,7 +38,9 @@ ROOT = Path(__file__).parents[2]
 ENV = "dptse_env:dptse/PrivateHighway-v1"
 TRAFFIC = 2001  # its incident falls into the seconds that are shown
 BLUE, ORANGE = COLOURS[:2]
-SCHEDULES = "round-robin", "paper", "oldest-first", "stale-variance", "speed-front", "oracle-error"
+SCHEDULES = (
+    "round-robin", "shift-ahead", "oldest-first", "stale-variance", "speed-front", "oracle-error",
+)  # fmt: skip
 SHOWN = slice(270, 410)  # seconds
 SECOND = 300
 

@@ -20,7 +20,7 @@ from dptse_env.utils.registry import Registry, name_of_class
 OBSERVATION_SCHEDULES = {
     "none": "dptse_env.schedules.rules:Nothing",
     "static": "dptse_env.schedules.rules:Static",
-    "paper": "dptse_env.schedules.rules:Paper",
+    "shift-ahead": "dptse_env.schedules.rules:ShiftAhead",
     "round-robin": "dptse_env.schedules.rules:RoundRobin",
     "random": "dptse_env.schedules.rules:Random",
     "oldest-first": "dptse_env.schedules.rules:OldestFirst",

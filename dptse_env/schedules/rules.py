@@ -85,7 +85,7 @@ class Static(Shifting):
     period = np.iinfo(np.int64).max
 
 
-class Paper(Shifting):
+class ShiftAhead(Shifting):
     """The schedule of Vishnoi et al. (section IV-A): a set that moves every four steps."""
 
     period = 4

@@ -29,7 +29,7 @@ from tests.helpers import SHORT
 
 ROWS = (
     ("largest-density-variance", "14.38 ± 0.27", "-1234.56 ± 7.89"),
-    ("paper", "9.10 ± 12.34", "-"),
+    ("shift-ahead", "9.10 ± 12.34", "-"),
 )
 
 
@@ -63,12 +63,12 @@ KEYWORDS = {"horizon": 80, "estimator": "random_walk"}
 
 @pytest.fixture(scope="module")
 def episode():
-    return watch("paper", Cell(SHORT, "paper", KEYWORDS, noise_seed=3), 0)
+    return watch("shift-ahead", Cell(SHORT, "shift-ahead", KEYWORDS, noise_seed=3), 0)
 
 
 def test_a_watched_episode_is_that_of_the_rows_and_maps_have_its_error(episode):
     env = gym.make(SHORT, traffic_seeds="0:1", **KEYWORDS)
-    assert episode.row == evaluate(env, "paper", [0], 3)[0]
+    assert episode.row == evaluate(env, "shift-ahead", [0], 3)[0]
     history, rmse = episode.history, episode.row["rmse_density"]
     assert len(history.truth) == len(episode.density_std) == len(episode.epsilon) == 81
     assert rmse == pytest.approx(np.sqrt(np.mean(np.square(history.rmse[61:]))))
@@ -100,8 +100,8 @@ def test_maps_stand_in_columns_with_one_bar(episode, tmp_path):
 
 def test_errors_of_every_policy_are_drawn_from_top_to_bottom():
     pair = {"density": Interval(10.0, 9.0, 11.0, 3), "speed": Interval(5.0, 4.0, 6.0, 3)}
-    rows = ["paper", "round-robin"]
-    figure = draw_errors(rows, {"ekf": dict.fromkeys(rows, pair), "ukf": {"paper": pair}})
+    rows = ["shift-ahead", "round-robin"]
+    figure = draw_errors(rows, {"ekf": dict.fromkeys(rows, pair), "ukf": {"shift-ahead": pair}})
     for axis, (name, interval) in zip(figure.axes, pair.items(), strict=True):
         assert axis.get_xlabel() == name
         assert [text.get_text() for text in axis.texts] == [f"{interval.mean:.1f}"] * 3
@@ -112,7 +112,7 @@ def test_errors_of_every_policy_are_drawn_from_top_to_bottom():
 def test_bars_begin_at_zero_and_those_of_learned_policies_stand_out():
     errors = {
         name: {"density": Interval(mean, mean - 1.0, mean + 1.0, 3)}
-        for name, mean in (("mine", 8.0), ("paper", 10.0))
+        for name, mean in (("mine", 8.0), ("shift-ahead", 10.0))
     }
     (axis,) = draw_bars(errors, ["mine"]).axes
     mine, paper = axis.patches
@@ -129,7 +129,7 @@ def test_a_wide_figure_is_made_as_narrow_as_a_page():
 
 
 def test_the_page_has_what_happened_and_needs_no_network(episode, tmp_path, monkeypatch):
-    errors = [("paper", {"rmse_density": (10.5, 1.0), "rmse_speed": (5.0, 0.5)})]
+    errors = [("shift-ahead", {"rmse_density": (10.5, 1.0), "rmse_speed": (5.0, 0.5)})]
     path = tmp_path / "page.html"
     write_page(path, "A title with <script>", errors, [episode], 0)
     text = path.read_text("utf-8")

@@ -64,11 +64,11 @@ def test_what_is_no_policy_is_refused(tmp_path):
 
 
 def test_a_schedule_has_a_name():
-    schedule, env = find_policy("paper"), gym.make(SHORT)
-    assert (schedule.keywords, schedule.identity) == ({}, "paper")
+    schedule, env = find_policy("shift-ahead"), gym.make(SHORT)
+    assert (schedule.keywords, schedule.identity) == ({}, "shift-ahead")
     observation, _ = env.reset(seed=0)
     action, _ = schedule.load(env).predict(observation, None, None)
-    expected, _ = make_schedule("paper", env).predict(observation, None, None)
+    expected, _ = make_schedule("shift-ahead", env).predict(observation, None, None)
     np.testing.assert_array_equal(action, expected)
 
 

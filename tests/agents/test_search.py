@@ -202,7 +202,7 @@ def make(search, settings):
 
 def test_trials_are_scored_as_an_evaluation_with_other_noise_seeds(tmp_path):
     settings = EstimatorSettings(process_noise=(0.02, 0.03))
-    expected = evaluate(make(SEARCH, settings), "paper", (0, 1), 1_000_000)
+    expected = evaluate(make(SEARCH, settings), "shift-ahead", (0, 1), 1_000_000)
     assert SEARCH.play(settings, (0, 1)) == expected
     first = run(tmp_path, 1, SEARCH).get_trials()[0]
     rows = SEARCH.play(EstimatorSettings(), (0, 1))

@@ -134,7 +134,7 @@ def test_broken_tables_and_those_of_another_study_are_refused(tmp_path):
 def test_an_id_says_all_that_rows_depend_on(tmp_path):
     first = cell(1)
     changes = [
-        {"env": "dptse_env:dptse/PaperHighway-v0"}, {"policy": "paper"}, {"noise_seed": 1},
+        {"env": "dptse_env:dptse/PaperHighway-v0"}, {"policy": "shift-ahead"}, {"noise_seed": 1},
         {"keywords": {"bandwidth": 2}}, {"deterministic": False}, {"watchers": ("queries",)},
     ]  # fmt: skip
     ids = {first.id, *(replace(first, **change).id for change in changes)}

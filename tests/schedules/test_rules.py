@@ -47,7 +47,7 @@ def test_shifting_sets_start_far_apart_and_move_downstream():
         assert start == [15 * i // bandwidth for i in range(bandwidth)]
     assert queried("static", 9) == [[0, 3, 6, 9, 12]] * 9
     assert queried("round-robin", 3) == [[0, 3, 6, 9, 12], [1, 4, 7, 10, 13], [2, 5, 8, 11, 14]]
-    sets = queried("paper", 61)
+    sets = queried("shift-ahead", 61)
     assert sets[:8] == [[0, 3, 6, 9, 12]] * 4 + [[1, 4, 7, 10, 13]] * 4
     assert sets[8] == [2, 5, 8, 11, 14]
     assert sets[60] == sets[12] == sets[0]
@@ -101,7 +101,7 @@ def test_oldest_first_asks_the_oldest_and_breaks_ties_in_turn():
 
 def test_stable_baselines3_evaluates_a_schedule():
     env = make_env(horizon=20, traffic_seeds="0:1")
-    mean, _ = evaluate_policy(make_schedule("paper", env), env, n_eval_episodes=2, warn=False)
+    mean, _ = evaluate_policy(make_schedule("shift-ahead", env), env, n_eval_episodes=2, warn=False)
     assert mean < 0
 
 

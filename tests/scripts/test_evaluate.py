@@ -90,7 +90,7 @@ def test_one_episode_has_no_interval(tmp_path):
 def test_it_goes_on_wherever_it_was_ended(tmp_path, monkeypatch):
     out, played, play_cell = tmp_path / "out", [], study._play_cell
     env = f'{SHORT} {{"estimator": "random_walk", "horizon": 64}}'
-    words = ["evaluate", "--env", env, "--seeds", "2000:2002", "--schedules", "none", "paper"]
+    words = ["evaluate", "--env", env, "--seeds", "2000:2002", "--schedules", "none", "shift-ahead"]
     words += ["--workers", "1", "--output", out]
 
     def play_two(*given):

@@ -64,10 +64,10 @@ SHORT, PRIVATE = "dptse_env:dptse/ShortHighway-v0", "dptse_env:dptse/PrivateHigh
 LONG, PAPER = "dptse_env:dptse/LongHighway-v0", "dptse_env:dptse/PaperHighway-v0"
 ROUND_ROBIN, ORACLE, GAIN = "round-robin", "oracle-error", "oracle-gain"
 RULES = (
-    ROUND_ROBIN, "paper", "oldest-first", "largest-variance", "stale-variance",
+    ROUND_ROBIN, "shift-ahead", "oldest-first", "largest-variance", "stale-variance",
     "largest-deviation", "speed-front", "expected-reduction",
 )  # fmt: skip
-"""Policies that need no training; "paper" is the paper's schedule."""
+"""Policies that need no training; "shift-ahead" is the paper's schedule."""
 PLACKETT_LUCE, STARTED = "plackett-luce", "ppo-from-plackett-luce"
 LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "ppo-perceptron": ("ppo", {"policy": "mlp"}),

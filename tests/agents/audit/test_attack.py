@@ -93,9 +93,9 @@ def sums_in(record, setting, observed, terms):
 def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(setting, factor, record):
     """Against ledgers in plain Python, on a schedule that mostly looks elsewhere."""
     setting = attacked_form(setting)
-    worlds = Planner(setting, "paper").choose(record, "replaced")
+    worlds = Planner(setting, "shift-ahead").choose(record, "replaced")
     process, release = make_overheard(setting, worlds, 2, factor)
-    plan, heard = public_plan(setting, "paper"), []
+    plan, heard = public_plan(setting, "shift-ahead"), []
     # What is left of runs before must not matter.
     for steps in (plan[:7], plan):
         heard.clear()

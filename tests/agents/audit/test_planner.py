@@ -293,7 +293,7 @@ def test_contributions_are_spent_where_they_tell_most():
 
 
 def test_public_schedules_are_those_of_the_environment():
-    plan = public_plan(config(), "paper")
+    plan = public_plan(config(), "shift-ahead")
     # Two of six segments, shifted downstream every four seconds.
     assert [np.flatnonzero(row).tolist() for row in plan[[0, 3, 4, 8]]] == [
         [0, 3], [0, 3], [1, 4], [2, 5],

@@ -50,9 +50,9 @@ def test_the_tables_are_those_of_the_rows(rows, tmp_path, monkeypatch):
 
 
 def test_a_cell_that_was_not_played_is_a_dash(rows, tmp_path):
-    few = rows.filter(pl.col("cell").is_in([priced("ekf").id, paid(schedule="paper").id]))
+    few = rows.filter(pl.col("cell").is_in([priced("ekf").id, paid(schedule="shift-ahead").id]))
     text = report(few, tmp_path)
-    assert line_of(text, "4. `paced`, demand states, `paper` (2)")[1:3] == [
+    assert line_of(text, "4. `paced`, demand states, `shift-ahead` (2)")[1:3] == [
         "17.76 [16.93, 18.59]",
         "-",
     ]
@@ -60,7 +60,7 @@ def test_a_cell_that_was_not_played_is_a_dash(rows, tmp_path):
     few = rows.filter(pl.col("cell") == priced("ekf").id)
     few = few.select(name for name in few.columns if not few[name].null_count())
     text = report(few, tmp_path)
-    assert line_of(text, "1. `capped`, EKF, `paper` (1)")[1:] == ["-"] * 5
+    assert line_of(text, "1. `capped`, EKF, `shift-ahead` (1)")[1:] == ["-"] * 5
     assert line_of(text, "EKF, nominal")[1] == "26.18 [24.44, 27.92]"
     assert [path.name for path in tmp_path.iterdir()] == ["fig_claimed.png"]
 

@@ -18,7 +18,7 @@ from tests.agents.training.plans import SMALL
 from tests.helpers import SHORT
 
 RECORDED = Path(__file__).parents[3] / "results" / "policies"
-BEST, OTHER = "speed-front", "paper"
+BEST, OTHER = "speed-front", "shift-ahead"
 
 
 def rows_of(policy, errors, part=TEST, setting="short", seed=-1, digest=""):
@@ -228,9 +228,9 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     for module in (policies, policies.trainings):
         monkeypatch.setattr(module, "LEARNERS", learners)
         monkeypatch.setattr(module, "SETTINGS", {"short": setting})
-        monkeypatch.setattr(module, "RULES", (ROUND_ROBIN, "paper"))
+        monkeypatch.setattr(module, "RULES", (ROUND_ROBIN, OTHER))
     monkeypatch.setattr(policies, "SHIPPED", {})
-    cells = tuple(policies._cell("short", rule, VALIDATION) for rule in (ROUND_ROBIN, "paper"))
+    cells = tuple(policies._cell("short", rule, VALIDATION) for rule in (ROUND_ROBIN, OTHER))
     study = policies.Study("policies", cells, (), policies.report, policies.test_cells)
     place = Place(tmp_path, THIS_PROCESS)
     train_ladder(study, place, 0.05, (0,))
