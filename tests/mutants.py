@@ -315,7 +315,7 @@ MUTANTS = (
     ),
     Mutant(
         "released boundary segments are not charged", 11, "release/vehicles.py",
-        "ledgers[g, v] += cost", "ledgers[g, v] += cost if s < n_places - 4 else 0.0",
+        "ledgers[g, v] += cost", "ledgers[g, v] += cost if s < n_cells - 4 else 0.0",
         "test_guarantee.py",
     ),
     Mutant(
