@@ -7,7 +7,7 @@ configuration holds and checks; `dptse_env.parts` makes what it describes.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Annotated, Any, NamedTuple
@@ -165,9 +165,7 @@ class EnvConfig:
         """
         places = origins or {}
         fields: dict[str, Any] = {"inherited": inherited, "origins": places}
-        for key in values:
-            if key not in {*KEYWORDS, *SHORTCUTS}:
-                raise _unknown(key, places.get(key, ""))
+        _require_known(values, places)
         for name, keyword in KEYWORDS.items():
             value, needs = getattr(base or EnvConfig, name), [fields[n] for n in keyword.needs]
             if name not in values and keyword.default is not None:
@@ -521,6 +519,37 @@ SHORTCUTS = {
 """Keywords that stand for a field of another one."""
 
 
+class UnknownKeywordError(TypeError, ValueError):
+    """A keyword that an environment does not have.
+
+    A ``TypeError`` as for any function, since libraries that try keywords on environments look for
+    it, and a ``ValueError`` as for every other bad keyword.
+    """
+
+
+def _require_known(keywords: Iterable[str], origins: Mapping[str, str]) -> None:
+    """Refuse a keyword that there is not, and say what has such a field."""
+    unknown = [key for key in keywords if key not in {*KEYWORDS, *SHORTCUTS}]
+    if not unknown:
+        return
+    key = unknown[0]
+    # A plugin that nobody has used yet is a name.
+    models = [each for each in RELEASE_MODELS.values() if not isinstance(each, str)]
+    fields = {
+        "privacy": {name for each in models for name in field_hints(each.settings_type)},
+        "corridor": Corridor.hints(),
+    }
+    hints = [
+        f"it is a field of {name}, {name}={{{key!r}: ...}}; "
+        for name, known in fields.items()
+        if key in known
+    ]
+    raise UnknownKeywordError(
+        f"{origins.get(key, '')}{cut(key)} is unknown; {''.join(hints)}allowed: "
+        f"{', '.join((*KEYWORDS, *SHORTCUTS))} (got an unexpected keyword argument {shown(key)})"
+    )
+
+
 PRESETS = {
     "paper-highway": EnvConfig(),
     "private-highway": EnvConfig(
@@ -538,14 +567,6 @@ PRESETS = {
     "short-highway": EnvConfig(corridor="short-highway", bandwidth=2),
 }
 """Configurations by name."""
-
-
-class UnknownKeywordError(TypeError, ValueError):
-    """A keyword that an environment does not have.
-
-    A ``TypeError`` as for any function, since libraries that try keywords on environments look for
-    it, and a ``ValueError`` as for every other bad keyword.
-    """
 
 
 def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
@@ -582,6 +603,7 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
             if _is_tuned_for_another(table.get("estimator_settings"), estimator):
                 del table["estimator_settings"]
         values, assumed = {**table, **overrides, "corridor": road.corridor}, road.assumed
+    _require_known(values, origins)
     config = EnvConfig(base, origins=origins, **values)
     inherited = _inherited(config, values, assumed)
     if not inherited:
@@ -602,25 +624,6 @@ def _is_tuned_for_another(settings: Any, estimator: Any) -> bool:
         return False
     name = estimator if isinstance(estimator, str) else ESTIMATORS.name_of(estimator)
     return tuned_estimator(settings) != name
-
-
-def _unknown(key: str, origin: str) -> UnknownKeywordError:
-    """Return the error for a keyword that there is not, with those that have such a field."""
-    # A plugin that nobody has used yet is a name.
-    models = [each for each in RELEASE_MODELS.values() if not isinstance(each, str)]
-    fields = {
-        "privacy": {name for each in models for name in field_hints(each.settings_type)},
-        "corridor": Corridor.hints(),
-    }
-    hints = [
-        f"it is a field of {name}, {name}={{{key!r}: ...}}; "
-        for name, known in fields.items()
-        if key in known
-    ]
-    return UnknownKeywordError(
-        f"{origin}{cut(key)} is unknown; {''.join(hints)}allowed: "
-        f"{', '.join((*KEYWORDS, *SHORTCUTS))} (got an unexpected keyword argument {shown(key)})"
-    )
 
 
 def _inherited(

@@ -251,6 +251,12 @@ def test_models_of_single_segments_take_what_says_so():
     assert resolve("short-highway", {"privacy": "capped", "query_spans": [1]}).queries.are_segments
 
 
+@pytest.mark.parametrize("name", ["base", "inherited", "origins"])
+def test_what_a_configuration_keeps_beside_its_keywords_is_no_keyword(name):
+    with pytest.raises(UnknownKeywordError, match=rf"^{name} is unknown; allowed: corridor, "):
+        resolve("short-highway", {name: ()})
+
+
 def test_the_hint_on_an_unknown_keyword_imports_no_plugin(monkeypatch):
     monkeypatch.setitem(RELEASE_MODELS._parts, "other", "nowhere:Model")
     with pytest.raises(UnknownKeywordError, match="it is a field of privacy"):
