@@ -283,7 +283,7 @@ def _privacy(path: str, value: Any, base: PrivacySettings, corridor: Corridor) -
             base = expected(preset=preset, epsilon=base.epsilon, delta=base.delta)
         value = from_mapping(type(base), {**given, "preset": preset}, path, base)
     model = RELEASE_MODELS.find(value.preset)
-    blind = "one that needs no vehicles, as 'paper', on a road of measured fields"
+    blind = "one that needs no vehicles, as 'printed', on a road of measured fields"
     is_served = has_vehicles(corridor.source.recordings) or not model.needs_vehicles
     require(is_served, f"{path}.preset", blind, RELEASE_MODELS.name_of(value.preset))
     own = f"'seeded' {_with_model(value)}, whose noise is its own"

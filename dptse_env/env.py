@@ -133,7 +133,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `bandwidth_unit`     | "segments"      | or `sums`: what a query costs                       |
     | `action`             | "mask"          | encoding of actions, see above                      |
     | `observation`        | ("default",)    | blocks of the observation, see above                |
-    | `privacy`            | "paper"         | or `corrected`, `capped`, `paced`, a mapping        |
+    | `privacy`            | "printed"       | or `corrected`, `capped`, `paced`, a mapping        |
     | `penetration`        | 1.0             | share of connected vehicles, or a mapping           |
     | `detectors`          | {}              | errors of the fixed sensors, a mapping              |
     | `fusion`             | {}              | how queries and sensors are put together            |
@@ -154,10 +154,10 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
 
     | id                  | n   | S   | record | release, epsilon | bandwidth | demand, incident |
     | :--                 | :-- | :-- | :--    | :--              | :--       | :--              |
-    | `PaperHighway-v0`   | 15  | 19  | 700 s  | paper, 1         | 5         | fixed            |
+    | `PaperHighway-v0`   | 15  | 19  | 700 s  | printed, 1       | 5         | fixed            |
     | `PrivateHighway-v1` | 15  | 19  | 700 s  | paced, 5         | 5         | random           |
     | `LongHighway-v0`    | 120 | 128 | 1200 s | paced, 5         | 8         | random           |
-    | `ShortHighway-v0`   | 6   | 8   | 240 s  | paper, 1         | 2         | fixed            |
+    | `ShortHighway-v0`   | 6   | 8   | 240 s  | printed, 1       | 2         | fixed            |
 
     **Rendering**: true density, estimate, queries and error over space and time, as a picture
     (``rgb_array``) or in a window (``human``). It shows true traffic.

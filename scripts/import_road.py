@@ -114,7 +114,7 @@ class Field:
         --cell 0.1 --interval 5 --name my-field --segments 6 --lanes 3 \
         --speed-limit 100 --duration 90 --output my-field
 
-    A field has no vehicles: the release models paper and corrected work on it, those with a
+    A field has no vehicles: the release models printed and corrected work on it, those with a
     guarantee need the vehicles and say so.
     """
 

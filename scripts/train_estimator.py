@@ -55,7 +55,7 @@ class Args(Machines):
     """Train recurrent networks as an estimator."""
 
     kinds: tuple[Kind, ...] = ("flows", "speeds")
-    """Kinds of releases: flows (capped, paced), or speeds (paper, corrected)."""
+    """Kinds of releases: flows (capped, paced), or speeds (printed, corrected)."""
     seeds: str = "0:3"
     """Training seeds, first:stop; the best weights on validation traffic are taken."""
     env: tuple[str, ...] = ()

@@ -40,8 +40,8 @@ ESTIMATORS = (
 
 FROM_SECOND, STEPS = 240, 3  # a queue stands on the paper's road from second 200 on
 ROADS: dict[str, tuple[str, dict[str, Any]]] = {
-    "paper": ("PaperHighway-v0", {}),
-    "paper-w99": ("PaperHighway-v0", {"parameters": "w99-3lane"}),
+    "printed": ("PaperHighway-v0", {}),
+    "printed-w99": ("PaperHighway-v0", {"parameters": "w99-3lane"}),
     "corrected": ("PrivateHighway-v1", {"privacy": "corrected"}),
     "capped": ("PrivateHighway-v1", {"privacy": "capped"}),
     "paced": ("PrivateHighway-v1", {}),
@@ -60,11 +60,11 @@ SCHEDULES = (
 POLICIES = {
     "private-highway": "paced",
     "private-highway-capped": "capped",
-    "short-highway": "paper",
+    "short-highway": "printed",
 }
 """Some policies of the package, and the release models that they were trained for."""
 RELEASES: dict[str, dict[str, Any]] = {
-    "paper": {"privacy": "paper"},
+    "printed": {"privacy": "printed"},
     "corrected": {"privacy": "corrected"},
     "capped": {"privacy": "capped"},
     "capped-event": {"privacy": {"preset": "capped", "unit": "event"}},

@@ -110,14 +110,14 @@ def test_incident_and_demand_by_name():
 
 def test_tuned_settings_are_found_by_estimator_parameters_privacy_and_road():
     for estimator, parameters, privacy in itertools.product(
-        ("ekf", "open_loop"), ("paper", "w99-3lane"), ("paper", "corrected")
+        ("ekf", "open_loop"), ("paper", "w99-3lane"), ("printed", "corrected")
     ):
         keywords = {"estimator": estimator, "parameters": parameters, "privacy": privacy}
         settings = resolve("paper-highway", keywords).settings()
         name = f"{estimator}-{parameters}-{privacy}"
         known = name in available_settings()
         assert settings == (load_settings(name) if known else EstimatorSettings())
-    assert "ekf-w99-3lane-paper" in available_settings()
+    assert "ekf-w99-3lane-printed" in available_settings()
     long = resolve("long-highway", {})
     assert long.settings_name == "ekf-w99-3lane-paced-long-highway"
     assert resolve("long-highway", {"estimator": "mhe"}).settings_name == "mhe-w99-3lane-paced"
@@ -128,15 +128,15 @@ def test_tuned_settings_are_found_by_estimator_parameters_privacy_and_road():
 
 
 def test_a_tuned_set_by_name_serves_any_estimator():
-    keywords = {"estimator": "ukf", "estimator_settings": "ekf-w99-3lane-paper"}
+    keywords = {"estimator": "ukf", "estimator_settings": "ekf-w99-3lane-printed"}
     config = resolve("paper-highway", keywords)
-    assert config.estimator_settings == "ekf-w99-3lane-paper"
-    assert config.settings() == load_settings("ekf-w99-3lane-paper")
+    assert config.estimator_settings == "ekf-w99-3lane-printed"
+    assert config.settings() == load_settings("ekf-w99-3lane-printed")
 
 
 def test_a_mapping_of_settings_keeps_what_would_have_been_chosen():
     keywords = {"parameters": "w99-3lane", "estimator_settings": {"mhe": {"horizon": 3}}}
-    tuned = load_settings("ekf-w99-3lane-paper")
+    tuned = load_settings("ekf-w99-3lane-printed")
     assert tuned.process_noise != EstimatorSettings().process_noise
     expected = dataclasses.replace(tuned, mhe=dataclasses.replace(tuned.mhe, horizon=3))
     assert resolve("paper-highway", keywords).settings() == expected
@@ -147,7 +147,7 @@ def test_a_mapping_of_settings_keeps_what_would_have_been_chosen():
 
 
 BAD_SETTINGS = [
-    ("ekf", "best", r" must be one of .*ekf-w99-3lane-paper.*, got 'best'$"),
+    ("ekf", "best", r" must be one of .*ekf-w99-3lane-printed.*, got 'best'$"),
     ("ekf", {"noise": 1.0}, r"\.noise is unknown; allowed: "),
     ("ekf", {"mhe": {"horizon": 0}}, r"\.mhe\.horizon must be an integer in 1"),
     ("mhe", {"process_noise": [0.01, 0.0]}, r"\.process_noise\[1\] must be a finite number > 0"),
@@ -174,7 +174,7 @@ def test_bad_privacy_is_named_with_its_path():
         ({"preset": "capped", "cap": 2.5}, "cap must be"),
         ({"epsilon": 0}, "epsilon must be"),
         ({"unit": "week"}, "unit must be one of"),
-        ({"preset": "paper", "cap": 3}, "cap is unknown"),
+        ({"preset": "printed", "cap": 3}, "cap is unknown"),
     ):
         with pytest.raises(ValueError, match=rf"^privacy\.{message}"):
             resolve("private-highway", {"privacy": privacy})
@@ -208,7 +208,7 @@ def test_a_void_guarantee_is_warned_of_with_its_reason():
 
 def test_no_warning_where_no_guarantee_is_requested_or_it_holds():
     second = {"preset": "capped", "boundary_inputs": "private", "unit": "event"}
-    for privacy in ("paper", "corrected", "capped", second):
+    for privacy in ("printed", "corrected", "capped", second):
         warn_where_void(resolve("private-highway", {"privacy": privacy}))  # would be an error here
 
 
@@ -236,7 +236,7 @@ BAD_QUERIES = [
     ({"privacy": MeanRelease, "query_spans": (1, 2)}, r"query_spans must be \(1,\) where mean"),
     *[
         ({"privacy": preset, "query_spans": [1, 2]}, rf"query_spans must be .* model '{preset}'")
-        for preset in ("paper", "corrected", "capped")
+        for preset in ("printed", "corrected", "capped")
     ],
 ]
 

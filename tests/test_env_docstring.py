@@ -60,11 +60,11 @@ def test_its_spaces_of_actions_are_those_of_the_encodings():
         assert env.action_space == eval(space, known)
 
 
-@pytest.mark.parametrize("privacy", ["paper", "paced"])
+@pytest.mark.parametrize("privacy", ["printed", "paced"])
 def test_its_keys_of_info_are_those_of_episodes(privacy):
     env = gym.make(SHORT, privacy=privacy, traffic_seeds=[0], truth_in_info=True, epsilon=5)
     keys = [row[0] for row in table("key")]
-    if privacy == "paper":
+    if privacy == "printed":
         keys = [key for key in keys if key not in ("prices", "spent_share", "centre_fallback")]
     at_reset = env.reset(seed=0)[1]
     assert {*at_reset} == {*keys}

@@ -22,7 +22,7 @@ from tests.helpers import fast_and_slow
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
-IDS = {"paper": "ShortHighway-v0", "capped": "PrivateHighway-v1", "paced": "PrivateHighway-v1"}
+IDS = {"printed": "ShortHighway-v0", "capped": "PrivateHighway-v1", "paced": "PrivateHighway-v1"}
 
 
 def make_private(preset="capped", **keywords):
@@ -110,7 +110,7 @@ def unlike(env, schedule=None):
 
 WAYS = [
     ("capped", "ekf", "mask"), ("capped", "mhe", "sequential"), ("paced", "ukf", "scores"),
-    ("paced", "enkf", "slots"), ("paced", "recurrent", "slots"), ("paper", "blend", "mask"),
+    ("paced", "enkf", "slots"), ("paced", "recurrent", "slots"), ("printed", "blend", "mask"),
 ]  # fmt: skip
 EVERY_WAY = list(itertools.product(IDS, ESTIMATORS, ACTION_ENCODINGS))
 
@@ -119,7 +119,7 @@ EVERY_WAY = list(itertools.product(IDS, ESTIMATORS, ACTION_ENCODINGS))
 def test_traffic_does_not_show(preset, estimator, action):
     """Where boundary segments are released and where they are not, for trips and for seconds."""
     privacy, alive = {}, ["observation", "queried"]
-    if preset != "paper":
+    if preset != "printed":
         privacy["unit"] = ("trip", "event")[EVERY_WAY.index((preset, estimator, action)) % 2]
     if preset == "paced":
         alive += ["centre"] if privacy["unit"] == "event" else ["centre", "prices", "sigmas"]
@@ -155,7 +155,7 @@ PARTLY = {"penetration": [0.05, 0.4], "detectors": {"dropout": 0.2, "absolute": 
     ("preset", "estimator"),
     fast_and_slow(
         itertools.product(IDS, ESTIMATORS),
-        [("paced", "ekf"), ("capped", "mhe"), ("paced", "ukf"), ("paper", "random_walk")],
+        [("paced", "ekf"), ("capped", "mhe"), ("paced", "ukf"), ("printed", "random_walk")],
     ),
 )
 def test_neither_traffic_nor_who_is_connected_shows(preset, estimator):
@@ -190,7 +190,7 @@ def test_what_is_released_of_traffics_does_differ():
 
 @pytest.mark.parametrize(
     ("preset", "estimator", "shows"),
-    [("paper", "ekf", True), ("capped", "mhe", True), ("paced", "random_walk", False)],
+    [("printed", "ekf", True), ("capped", "mhe", True), ("paced", "random_walk", False)],
 )
 @pytest.mark.filterwarnings("ignore:.*no privacy is guaranteed:UserWarning")
 def test_true_boundary_inputs_would_show(preset, estimator, shows):

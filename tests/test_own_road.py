@@ -150,7 +150,7 @@ MINE = {
     ("source", "keywords", "name"),
     [
         (None, {}, "ekf-w99-3lane-paced"),
-        (None, {"estimator": "random_walk", "privacy": "paper"}, "random_walk-w99-3lane-paper"),
+        (None, {"estimator": "random_walk", "privacy": "printed"}, "random_walk-w99-3lane-printed"),
         ("paper", {"privacy": "corrected"}, "ekf-paper-corrected"),
     ],
 )

@@ -40,8 +40,8 @@ def sampled(process, n_steps):
 
 
 FORKS = [
-    ("ekf", PAID, "compiled"), ("ukf", COUNTED, "compiled"), ("enkf", "paper", "compiled"),
-    ("mhe", PAID, "compiled"), ("ekf", COUNTED, "reference"), ("recurrent", "paper", "compiled"),
+    ("ekf", PAID, "compiled"), ("ukf", COUNTED, "compiled"), ("enkf", "printed", "compiled"),
+    ("mhe", PAID, "compiled"), ("ekf", COUNTED, "reference"), ("recurrent", "printed", "compiled"),
 ]  # fmt: skip
 
 
@@ -51,7 +51,7 @@ FORKS = [
         [
             (name, privacy, backend)
             for backend, names in (("compiled", ESTIMATORS), ("reference", REFERENCES))
-            for name, privacy in itertools.product(names, ["paper", COUNTED, PAID])
+            for name, privacy in itertools.product(names, ["printed", COUNTED, PAID])
         ],
         FORKS,
     ),

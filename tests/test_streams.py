@@ -83,7 +83,7 @@ PARTLY = {"penetration": 0.3, "detectors": {"dropout": 0.2, "absolute": 0.5}}
         ("ekf", {"preset": "paced", "boundary_inputs": "private"}, {}),
         ("mhe", {"preset": "capped", "cap": 5, "boundary_inputs": "private"}, {}),
         ("recurrent", "paced", PARTLY),
-        ("blend", "paper", PARTLY),
+        ("blend", "printed", PARTLY),
     ],
 )
 def test_an_episode_is_as_in_a_fresh_environment(estimator, privacy, keywords):

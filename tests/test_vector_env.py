@@ -40,11 +40,11 @@ def staggered(**keywords):
 
 # --- lock step with the scalar environment --------------------------------------------------------
 
-EVERY_WAY = [(e, a, "paper") for e in ESTIMATORS for a in ACTION_ENCODINGS]
+EVERY_WAY = [(e, a, "printed") for e in ESTIMATORS for a in ACTION_ENCODINGS]
 EVERY_WAY += [(e, "mask", privacy) for e in ESTIMATORS for privacy in (COUNTED, PAID)]
 WAYS = [
-    ("ekf", "sequential", "paper"), ("ukf", "mask", COUNTED), ("enkf", "scores", "paper"),
-    ("mhe", "mask", PAID), ("blend", "mask", COUNTED), ("recurrent", "slots", "paper"),
+    ("ekf", "sequential", "printed"), ("ukf", "mask", COUNTED), ("enkf", "scores", "printed"),
+    ("mhe", "mask", PAID), ("blend", "mask", COUNTED), ("recurrent", "slots", "printed"),
 ]  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from dptse_env.utils.validation import Interval, checked_fields, require
 Kind = Literal["flows", "speeds"]
 """Kind of the numbers that are released beside densities; weights suit one kind."""
 MECHANISMS: dict[Kind, tuple[str, ...]] = {
-    "flows": ("capped", "paced"), "speeds": ("paper", "corrected"),
+    "flows": ("capped", "paced"), "speeds": ("printed", "corrected"),
 }  # fmt: skip
 """Release models of scenarios."""
 SCHEDULES = (

@@ -140,7 +140,7 @@ WORLD_CELLS = [
 
 # ---- The second part: a share of the vehicles answers, beside detectors. ----
 
-RELEASES = ("paper", "corrected", "capped", "paced")
+RELEASES = ("printed", "corrected", "capped", "paced")
 GUARANTEED = ("capped", "paced")
 """Release models in which queries and detectors share a budget."""
 ESTIMATORS = (EKF, "ukf", "enkf", "mhe", LEARNED, SMOOTHING, WALK)
@@ -155,7 +155,7 @@ EPSILON, WHOLE_EPSILON = 5.0, 8.449590646976443
 UNKNOWN, MISREPORTING, WITHOUT = ("unknown share", "misreporting", "without")
 FACTORS = {"high": 4.0 / 3.0, "low": 2.0 / 3.0}
 """Factor on the counts of a detector that miscounts."""
-FAULTY_RELEASES = ("paper", "paced")
+FAULTY_RELEASES = ("printed", "paced")
 FAULTY = list(product(FAULTY_RELEASES, ESTIMATORS[:-1]))
 RANKED = (ROUND_ROBIN, "shift-ahead", "oldest-first", "largest-variance", "static")
 RANKED_SHARES = ("100 %", "30 %", "10 %", "3 %")

@@ -100,23 +100,23 @@ class Exact(Paced):
 ESTIMATORS = ("ekf", "random_walk")
 EPSILONS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 BOUNDARIES, BANDWIDTHS = ("nominal", "private", "true"), (3, 5, 8, 15)
-TRIP, PAPER, CORRECTED = "trip, C = 64", "`paper` noise", "`corrected` noise"
+TRIP, PRINTED, CORRECTED = "trip, C = 64", "`printed` noise", "`corrected` noise"
 PROTECTIONS: dict[str, dict[str, Any]] = {
     "event": {"preset": "capped", "unit": "event"},
     **{f"trip, C = {c}": {"preset": "capped", "unit": "trip", "cap": c} for c in (4, 16, CAP)},
     "horizon": {"preset": "capped", "unit": "trip", "cap": 700},
-    PAPER: {"preset": "paper"},
+    PRINTED: {"preset": "printed"},
     CORRECTED: {"preset": "corrected"},
 }
 """Privacy settings by their name in the tables."""
-PRINTED = (PAPER, CORRECTED)
+SPEEDS = (PRINTED, CORRECTED)
 
 
 def priced(estimator: str, protection: str = TRIP, **changes: Any) -> Cell:
     """Return a cell of the price of a guarantee; the boundary is by default the preset's own."""
     given = {
         "estimator": estimator, "protection": protection, "epsilon": 5.0, "bandwidth": 5,
-        "boundary": "true" if protection in PRINTED else "nominal",
+        "boundary": "true" if protection in SPEEDS else "nominal",
     } | changes  # fmt: skip
     privacy = {"epsilon": given["epsilon"], "delta": DELTA, "boundary_inputs": given["boundary"]}
     privacy |= PROTECTIONS[protection]
@@ -240,7 +240,7 @@ CLAIMS: dict[str, Callable[[EnvConfig], float]] = {
     f"met {CAP} times, alone, standing": partial(met_epsilon, alone=True),
 }
 """Accounts of the paper's noise, by assumption."""
-CLAIMED = [f"{noise}: {claim}" for noise, claim in product(PRINTED, CLAIMS)]
+CLAIMED = [f"{noise}: {claim}" for noise, claim in product(SPEEDS, CLAIMS)]
 
 
 def true_epsilon(line: str, claimed: float) -> float:
@@ -297,7 +297,7 @@ def price_tables(ask: Ask) -> Iterator[str]:
         yield f"## {LABELS[name]}: {error} against ε"
         makers = {each: partial(priced, name, each) for each in PROTECTIONS}
         lines: dict[str, Line] = {each: (metric, make) for each, make in makers.items()}
-        for noise in PRINTED:
+        for noise in SPEEDS:
             lines[f"{TRIP} − {noise}"] = metric, makers[TRIP], makers[noise]
         yield sweep(ask, "protection", along(EPSILONS), lines)
     yield "## Boundary inputs, ε = 5"
@@ -442,7 +442,7 @@ LOOKS = {
     "trip, C = 16": Look("#4393c3", "o"),
     TRIP: Look("#08306b", "o"),
     "horizon": Look("#d55e00", "^"),
-    PAPER: Look("#cc79a7", "D"),
+    PRINTED: Look("#cc79a7", "D"),
     CORRECTED: Look("#7d5ba6", "v"),
 }
 

@@ -3,7 +3,7 @@
 S. C. Vishnoi, A. F. Taha, S. A. Nugroho and C. G. Claudel, "On Differential Privacy and Traffic
 State Estimation Problem for Connected Vehicles": errors against the number of CV segments, a map of
 density over space and time, density error against epsilon and against delta, and the time of a
-step. Each is played under the noise as printed (``paper``) and as the paper's theorem needs it
+step. Each is played under the noise as printed (``printed``) and as the paper's theorem needs it
 (``corrected``), with the paper's ARZ parameters and with calibrated ones (``w99-3lane``).
 
 A claim has parts. A part is one number for each traffic seed, in most cases a difference of two
@@ -93,7 +93,7 @@ RUN_TIME, SPACE_TIME = "run_time.parquet", "space_time.parquet"
 DPI = 90
 SETTINGS = {
     f"{privacy} noise, {parameters} parameters": {"parameters": parameters, "privacy": privacy}
-    for privacy, parameters in itertools.product(("paper", "corrected"), ("paper", "w99-3lane"))
+    for privacy, parameters in itertools.product(("printed", "corrected"), ("paper", "w99-3lane"))
 }
 """Choices that the paper leaves open, by name; each result is shown under all of them."""
 
@@ -105,7 +105,7 @@ def labels_of(estimator: str, setting: str, **swept: float) -> dict[str, Any]:
     """
     labels = {"estimator": estimator, **SETTINGS[setting], **BASE, **swept}
     if estimator == "open_loop":
-        labels |= {"privacy": "paper", **BASE, "bandwidth": 1}
+        labels |= {"privacy": "printed", **BASE, "bandwidth": 1}
     return labels
 
 

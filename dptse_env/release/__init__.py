@@ -5,7 +5,7 @@ from dptse_env.release.gaussian import (
     CappedSettings,
     Corrected,
     GaussianRelease,
-    Paper,
+    Printed,
     require_gaussian,
 )
 from dptse_env.release.model import ReleaseModel, check_released
@@ -20,7 +20,7 @@ from dptse_env.utils.registry import Registry
 
 RELEASE_MODELS = Registry(
     "privacy.preset",
-    {"paper": Paper, "corrected": Corrected, "capped": Capped, "paced": Paced},
+    {"printed": Printed, "corrected": Corrected, "capped": Capped, "paced": Paced},
     check=lambda part: (
         None
         if isinstance(part, type) and issubclass(part, ReleaseModel)
@@ -45,7 +45,7 @@ __all__ = [
     "Paced",
     "PacedSettings",
     "Pacing",
-    "Paper",
+    "Printed",
     "PrivacyReport",
     "PrivacySettings",
     "QuantityReport",

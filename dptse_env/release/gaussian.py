@@ -1,4 +1,4 @@
-"""Release models with Gaussian noise of a constant deviation: `Paper`, `Corrected`, `Capped`."""
+"""Release models with Gaussian noise of a constant deviation: `Printed`, `Corrected`, `Capped`."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ def require_gaussian(release: ReleaseModel, user: str) -> GaussianRelease:
     return release
 
 
-class Paper(GaussianRelease):
+class Printed(GaussianRelease):
     """True density and mean speed of all vehicles, with the noise as printed in the paper.
 
     Where a group of channels does not see all vehicles, of those that it sees.
@@ -252,10 +252,10 @@ class Paper(GaussianRelease):
         return sums
 
 
-class Corrected(Paper):
-    """The same as `Paper`, with the noise that the theorem cited there needs, per release."""
+class Corrected(Printed):
+    """The same as `Printed`, with the noise that the theorem cited there needs, per release."""
 
-    void_reasons: ClassVar[tuple[str, ...]] = Paper.void_reasons[1:]
+    void_reasons: ClassVar[tuple[str, ...]] = Printed.void_reasons[1:]
 
     def _noise_std(self, group: int) -> tuple[float, ...]:
         settings = self.task.settings

@@ -25,7 +25,7 @@ class PrivacySettings:
     """Settings of every release model, the keyword ``privacy``; subclasses add further ones.
 
     Attributes:
-        preset: The release model: ``paper``, ``corrected``, ``capped``, ``paced``, a registered
+        preset: The release model: ``printed``, ``corrected``, ``capped``, ``paced``, a registered
             name, ``"package.module:Class"``, or a class.
         epsilon: Privacy parameter epsilon.
         delta: Privacy parameter delta.
@@ -42,7 +42,7 @@ class PrivacySettings:
 
     default_boundary: ClassVar[BoundaryInputs] = "true"
 
-    preset: Any = "paper"
+    preset: Any = "printed"
     epsilon: Annotated[float, Interval(1e-4, 1e4)] = 1.0
     delta: Annotated[float, Interval(1e-12, 0.5, open_high=True)] = 0.05
     boundary_inputs: BoundaryInputs | None = None

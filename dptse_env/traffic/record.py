@@ -138,7 +138,7 @@ class Record:
             return self
         raise ValueError(
             f"{user} needs the vehicles of a record, and this traffic is a measured field of "
-            "density and speed: use the release model 'paper' or 'corrected'"
+            "density and speed: use the release model 'printed' or 'corrected'"
         )
 
     @property

@@ -205,7 +205,7 @@ def mixed(mechanism, env=SHORT):
     )
 
 
-@pytest.mark.parametrize("mechanism", ["paper", "paced"])
+@pytest.mark.parametrize("mechanism", ["printed", "paced"])
 def test_the_network_with_gradients_is_the_estimator(mechanism, tmp_path):
     """Torch makes of collected releases the estimates that the environment reported."""
     torch.manual_seed(0)
@@ -233,7 +233,10 @@ LONGER = f'{SHORT} {{"corridor": {{"n_mainline": 9}}}}'
 @pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
 def test_a_batch_mixes_scenarios_of_any_roads():
     """Releases of speeds and of flows, of single cells and of sums, on two roads."""
-    singles, sums = collect(mixed("paper"), WALK, None), collect(mixed("paced", LONGER), WALK, None)
+    singles, sums = (
+        collect(mixed("printed"), WALK, None),
+        collect(mixed("paced", LONGER), WALK, None),
+    )
     assert len(singles.cells.fixed) + 3 == len(sums.cells.fixed)
     batch = Batch([singles.pick(np.array([1])), sums.pick(np.array([0, 1]))])
     n = len(singles.cells.fixed)
@@ -248,7 +251,7 @@ def test_a_batch_mixes_scenarios_of_any_roads():
 
 
 def test_batches_are_drawn_from_all_scenarios():
-    collected = [collect(mixed("paper"), WALK, None), collect(mixed("corrected"), WALK, None)]
+    collected = [collect(mixed("printed"), WALK, None), collect(mixed("corrected"), WALK, None)]
     starts = {float(each.truth[:, k].sum()): 0 for each in collected for k in range(2)}
     rng, n_drawn, size = np.random.default_rng(0), 0, len(collected[0].cells.fixed)
     for _ in range(30):

@@ -58,6 +58,6 @@ def test_more_noise_costs():
     assert runs[1e4].density < 5.0
     assert all(value > 0.0 for score in runs.values() for value in score)
     # The paper's printed noise is less.
-    assert run(preset="paper").error < runs[1.0].error
+    assert run(preset="printed").error < runs[1.0].error
     with pytest.raises(ValueError, match=r"privacy\.preset must be one that needs no vehicles"):
         run(preset="capped")

@@ -125,7 +125,7 @@ def test_it_finds_the_best_settings(whole, tmp_path):
 
 def test_the_defaults_and_the_present_set_come_first_and_bad_trials_stop_early(whole):
     first, second, *others = whole.get_trials()
-    present = load_settings("ekf-w99-3lane-paper")
+    present = load_settings("ekf-w99-3lane-printed")
     for trial, settings in ((first, EstimatorSettings()), (second, present)):
         assert nested(trial.params)["process_noise"] == list(settings.process_noise)
         assert len(trial.intermediate_values) == 3
@@ -174,7 +174,7 @@ def test_a_score_that_is_not_finite_is_never_the_best(tmp_path):
     assert study.best_params["process_noise.0"] <= 0.01
     search = made_up(Broken, variant="0")
     study = run(tmp_path, 3, search)
-    with pytest.raises(ValueError, match="ekf-w99-3lane-paper-0: no trial ran to its end"):
+    with pytest.raises(ValueError, match="ekf-w99-3lane-printed-0: no trial ran to its end"):
         write(search, study, tmp_path / "x.json")
 
 
@@ -188,7 +188,7 @@ def test_a_score_that_is_not_finite_is_never_the_best(tmp_path):
 )
 def test_a_journal_of_another_search_is_refused(changes, named, tmp_path):
     run(tmp_path, 1)
-    with pytest.raises(ValueError, match=f"ekf-w99-3lane-paper.journal .*: {named}"):
+    with pytest.raises(ValueError, match=f"ekf-w99-3lane-printed.journal .*: {named}"):
         run(tmp_path, 2, made_up(**changes))
 
 

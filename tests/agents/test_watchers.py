@@ -168,9 +168,9 @@ def test_the_warm_up_and_speeds_of_empty_segments_do_not_count():
     assert found["n_free"] == 0.0
 
 
-@pytest.mark.parametrize("privacy", [PACED, "paper"])
+@pytest.mark.parametrize("privacy", [PACED, "printed"])
 def test_a_summary_is_of_honesty_and_refusals(privacy):
-    has_accounts = privacy != "paper"
+    has_accounts = privacy != "printed"
     more = ("honesty", *(("contributions",) if has_accounts else ()))
     keywords = {"horizon": 120, "bandwidth": 2}
     for row, whole in zip(

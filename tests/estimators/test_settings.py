@@ -76,12 +76,12 @@ def test_settings_survive_json():
 def test_shipped_sets_are_named_after_what_they_are_for():
     cells = itertools.product(ESTIMATORS, available_parameters(), RELEASE_MODELS)
     names = {settings_name(*cell, v) for cell in cells for v in ("", "demand", *CORRIDORS)}
-    assert "ekf-w99-3lane-paper" in available_settings()
+    assert "ekf-w99-3lane-printed" in available_settings()
     assert set(available_settings()) <= names
     for name in available_settings():
         assert load_settings(name) != EstimatorSettings()
     with pytest.raises(
-        ValueError, match=r"^estimator_settings must be one of .*ekf-paper-paper.*, got 'ekf'$"
+        ValueError, match=r"^estimator_settings must be one of .*ekf-paper-printed.*, got 'ekf'$"
     ):
         load_settings("ekf")
 

@@ -21,7 +21,7 @@ SHARE = 0.3
 N, SENSORS = 6, (3, 5, 7)
 COLUMNS = [7, 8, 9]
 """Columns of the sensors on 7, a ramp, 3 and 5."""
-PRESETS = ("paper", "corrected", "capped", "paced")
+PRESETS = ("printed", "corrected", "capped", "paced")
 QUIET = {"epsilon": 10_000.0}
 """So large an epsilon that the noise is far below one vehicle."""
 

@@ -98,7 +98,7 @@ def test_a_flow_is_a_sum_of_centred_and_clipped_speeds():
 def test_an_empty_segment_or_sensor_has_its_own_speed_limit(groups):
     road = short_road(1).replaced(fixed_sensors=(3, 5, 7), ramp_speed_limit=60.0)
     empty = Worlds(stays(0, 0.0, 1, present=False), road=road)
-    release = empty.started(PrivacySettings("paper"), groups=groups)
+    release = empty.started(PrivacySettings("printed"), groups=groups)
     every, task = road.road.limits, release.task
     found = release.true_values(request(1, n_columns=task.n_channels))
     np.testing.assert_array_equal(found[0, :, 1], every[task.channels.first])
@@ -133,7 +133,7 @@ def test_the_cap_belongs_to_trips_and_without_it_values_are_the_aggregates():
     assert event.budgets_spent(ONE).tolist() == [0.0]
 
 
-@pytest.mark.parametrize("preset", ["paper", "corrected", "capped"])
+@pytest.mark.parametrize("preset", ["printed", "corrected", "capped"])
 def test_a_vehicle_counts_alike_on_every_segment_in_units_of_the_noise(preset):
     road = UNEVEN.replaced(duration=T)
     n_columns = road.geometry.n_segments + road.geometry.n_boundaries
@@ -251,7 +251,7 @@ def test_the_sensitivity_of_the_paper_is_exceeded():
 # --- reports -------------------------------------------------------------------------------------
 
 
-def release_of(preset="paper", epsilon=1.0, delta=0.05, n_sensors=8, dwell=8.0, **keywords):
+def release_of(preset="printed", epsilon=1.0, delta=0.05, n_sensors=8, dwell=8.0, **keywords):
     """That of the paper's highway, three of whose sensors are fixed."""
     privacy = {"preset": preset, "epsilon": epsilon, "delta": delta, **keywords}
     values = {"privacy": privacy, "corridor": {"average_dwell": dwell}, "bandwidth": n_sensors - 3}
@@ -263,7 +263,7 @@ def release_of(preset="paper", epsilon=1.0, delta=0.05, n_sensors=8, dwell=8.0, 
 )
 def test_golden_range_of_the_printed_noise(n_sensors, average_dwell, epsilon):
     """From few sensors and brisk traffic to the most sensors of the paper's figures."""
-    found = release_of("paper", n_sensors=n_sensors, dwell=average_dwell).report()
+    found = release_of("printed", n_sensors=n_sensors, dwell=average_dwell).report()
     assert (found.claimed_epsilon, round(found.epsilon)) == (1.0, epsilon)
     assert found.epsilon == pytest.approx(get_epsilon_gaussian(1.0 / found.mu, 0.05), rel=1e-10)
 
@@ -271,7 +271,7 @@ def test_golden_range_of_the_printed_noise(n_sensors, average_dwell, epsilon):
 @pytest.mark.parametrize(
     ("preset", "reasons"),
     [
-        ("paper", ("literal_variance", *SENSITIVITY_REASONS, "releases_not_composed")),
+        ("printed", ("literal_variance", *SENSITIVITY_REASONS, "releases_not_composed")),
         ("corrected", SENSITIVITY_REASONS),
     ],
 )

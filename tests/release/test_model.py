@@ -14,7 +14,7 @@ from .worlds import COLUMNS, ONE, Worlds, request, stays
 
 def test_settings_default_to_the_paper_and_survive_json():
     settings = PrivacySettings()
-    assert settings == PrivacySettings("paper", 1, 0.05)
+    assert settings == PrivacySettings("printed", 1, 0.05)
     assert PrivacySettings(**json.loads(json.dumps(dataclasses.asdict(settings)))) == settings
     assert hash(settings) == hash(PrivacySettings())
     for two in (2, np.float64(2.0)):

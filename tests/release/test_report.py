@@ -11,14 +11,14 @@ from dptse_env.release import VOID_REASONS
 from dptse_env.release.report import in_order
 
 OWN = {
-    "paper": {"adjacency"},
+    "printed": {"adjacency"},
     "capped": {"unit", "cap", "adjacency", "share"},
     "paced": {"unit", "adjacency", "pace", "clip", "ratio"},
 }
 
 
 @pytest.mark.parametrize(
-    ("preset", "penetration"), [("paper", 0.5), ("capped", 1.0), ("capped", 0.5), ("paced", 0.5)]
+    ("preset", "penetration"), [("printed", 0.5), ("capped", 1.0), ("capped", 0.5), ("paced", 0.5)]
 )
 def test_the_dict_is_its_own_json_and_fresh_each_time(preset, penetration):
     keywords = {"privacy": preset, "penetration": penetration}

@@ -166,7 +166,7 @@ def test_fronts_are_queried_where_answers_surprised():
         assert_highest(env, action, score)
 
 
-@pytest.mark.parametrize("privacy", ["paper", "capped"])
+@pytest.mark.parametrize("privacy", ["printed", "capped"])
 @pytest.mark.parametrize("term", ["joint", "speed"])
 def test_the_expected_reduction_is_that_of_independent_updates(privacy, term):
     env = make_batch(privacy=privacy, reward=term, bandwidth=1)

@@ -148,7 +148,7 @@ def test_the_oracle_of_errors_asks_where_the_estimate_is_worst(reward):
 
 
 @pytest.mark.parametrize("keywords", [
-    {"privacy": "paper", "estimator": "enkf"}, {"privacy": PAID},
+    {"privacy": "printed", "estimator": "enkf"}, {"privacy": PAID},
     {"estimator": "random_walk", "reward": "speed"}, {"estimator": "ekf", "backend": "reference"},
 ], ids=str)  # fmt: skip
 def test_the_oracle_of_gains_asks_what_forks_without_noise_find_best(keywords):

@@ -5,7 +5,7 @@ import pytest
 
 from dptse_env.privacy import mu_of
 from dptse_env.release import ReleaseModel
-from dptse_env.release.gaussian import Paper
+from dptse_env.release.gaussian import Printed
 from scripts.audit import Args, main
 from tests.helpers import SHORT
 from tests.scripts.commands import refused
@@ -45,7 +45,7 @@ def test_a_guarantee_is_not_rejected_and_too_little_noise_is(tmp_path, capsys):
 
 
 def test_what_the_paper_promises_is_rejected_with_vehicles_of_the_record(tmp_path):
-    _, found = run(tmp_path, {"preset": "paper", "epsilon": 1.0}, target="replaced", runs=100)
+    _, found = run(tmp_path, {"preset": "printed", "epsilon": 1.0}, target="replaced", runs=100)
     assert found["verdict"] == "rejected"
     # The claim to users, not the account.
     assert found["result"]["claim"]["mu"] == pytest.approx(mu_of(1.0, 0.05))
@@ -62,7 +62,7 @@ def test_what_the_noise_alone_betrays_is_rejected(tmp_path, capsys):
     assert "verdict: rejected" in printed
 
 
-class Unstated(Paper):
+class Unstated(Printed):
     """Releases as in the paper, of which nothing is stated."""
 
     report = ReleaseModel.report
@@ -90,7 +90,7 @@ def test_the_paced_ledger_is_attacked_with_the_estimator_of_the_environment(fact
 @pytest.mark.parametrize(
     ("privacy", "factor", "verdict"),
     [
-        ({"preset": "paper", "epsilon": 1.0}, 1.0, "rejected"),
+        ({"preset": "printed", "epsilon": 1.0}, 1.0, "rejected"),
         (CAPPED, 1.0, "not rejected"),
         (CAPPED, 0.4, "rejected"),
     ],

@@ -28,11 +28,11 @@ COMMANDS = {
     "evaluate": (["--env", SHORT, *ONE], "tables.md"),
     "train": (["--env", SHORT, "--steps", "100", *ONE], "best.safetensors"),
     "train-estimator": (SMALL, "weights-flows.safetensors"),
-    "tune": (["--env", SHORT, "--estimators", "random_walk"], "random_walk-paper-paper.json"),
+    "tune": (["--env", SHORT, "--estimators", "random_walk"], "random_walk-paper-printed.json"),
     "suite": (["speed-front", "--cells", "short", *ONE], "card.json"),
     "study": (["examples.my_study:STUDY", *ONE], "tables.md"),
     "fit": (["road.toml", *ONE], "page.html"),
-    "audit": (["--env", SHORT, *ONE], "paper-worst-case-hunter.json"),
+    "audit": (["--env", SHORT, *ONE], "printed-worst-case-hunter.json"),
     "record": (["--env", SHORT], None),
     "import trajectories": (
         ["--files", "points.csv", "--format", "table", "--env", on("road.toml"), "--columns",

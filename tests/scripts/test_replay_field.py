@@ -28,7 +28,7 @@ def test_a_row_for_each_estimator(tmp_path):
     assert scores("--parameters", "paper")["ekf"]["error"] != usual["ekf"]["error"]
     assert scores("--epsilon", "50")["ekf"]["error"] < usual["ekf"]["error"]
     assert scores("--bandwidth", "1") != usual
-    assert scores("--preset", "paper")["ekf"]["error"] < usual["ekf"]["error"]
+    assert scores("--preset", "printed")["ekf"]["error"] < usual["ekf"]["error"]
     wide = scores("--settings", '{"noise_scale": [3.0, 3.0]}')
     assert wide["ekf"]["chi2_density"] != usual["ekf"]["chi2_density"]
 

@@ -44,7 +44,7 @@ def test_it_trains_a_pair_that_an_environment_takes(tmp_path, capsys):
         rows = read_progress(tmp_path / f"{kind}-{seed}")
         assert [row["round"] for row in rows] == [1, 1, 2]
         best.setdefault(kind, []).append((rows[-1]["validation"], seed))
-    for kind, privacy in (("flows", "capped"), ("speeds", "paper")):
+    for kind, privacy in (("flows", "capped"), ("speeds", "printed")):
         taken = read_weights(str(tmp_path / f"weights-{kind}.safetensors")).card["name"]
         assert taken == f"{kind}-{min(best[kind])[1]}"
         gym.make(SHORT, privacy=privacy, **keywords).reset(seed=0)

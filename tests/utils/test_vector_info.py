@@ -32,7 +32,7 @@ def test_vector_form_marks_the_episodes_that_have_a_value():
 
 
 def test_one_value_is_repeated_for_several_episodes():
-    info = {"mu": 0.5, "cap": None, "preset": "paper", "reasons": ["a"], "more": {"n": 3}}
+    info = {"mu": 0.5, "cap": None, "preset": "printed", "reasons": ["a"], "more": {"n": 3}}
     infos = repeated_infos(info, 2)
     assert infos["mu"].tolist() == [0.5, 0.5]
     assert infos["more"]["n"].dtype == np.int64

@@ -50,7 +50,7 @@ PACED, CORRECTED = "paced", "corrected"
 RELEASES: dict[str, dict[str, Any]] = {
     PACED: {"privacy": PACED, "epsilon": 5.0},
     CORRECTED: {"privacy": CORRECTED, "epsilon": 1.0},
-    "paper": {"privacy": "paper", "epsilon": 1.0},
+    "printed": {"privacy": "printed", "epsilon": 1.0},
 }
 """Keywords of the release models, which are those of the environments that come with them."""
 
@@ -102,7 +102,7 @@ OTHERS: dict[str, Road] = {
     },
     "another simulator": Road(PRIVATE, [_recorded("idm", IDM_SEEDS, bandwidth=2)]),
     "PrivateHighway-v1": Road(PRIVATE, [({}, MORE_SEEDS)]),
-    "PaperHighway-v0": Road(PAPER, [(_CALIBRATED, MORE_SEEDS)], ("paper", CORRECTED)),
+    "PaperHighway-v0": Road(PAPER, [(_CALIBRATED, MORE_SEEDS)], ("printed", CORRECTED)),
     "LongHighway-v0": Road(LONG, [({}, SEEDS)], (PACED,)),
 }
 """Beside the own roads: recorded ones, and those that weights are trained on."""

@@ -54,7 +54,7 @@ def sums_in(record, setting, observed, terms):
     ):
         if not 1 <= step <= HORIZON or not observed[step - 1, segment]:
             continue
-        if privacy.preset == "paper":
+        if privacy.preset == "printed":
             sums[step - 1, segment] += 1.0, speed
             continue
         price = (
@@ -70,7 +70,7 @@ def sums_in(record, setting, observed, terms):
         if paid.get(vehicle, 0.0) + cost <= budget:
             paid[vehicle] = paid.get(vehicle, 0.0) + cost
             sums[step - 1, segment] += 1.0, d
-    if privacy.preset == "paper":
+    if privacy.preset == "printed":
         counts = sums[..., 0]
         means = np.where(
             counts > 0, sums[..., 1] / np.maximum(counts, 1.0), ROAD.geometry.speed_limit
@@ -82,7 +82,7 @@ def sums_in(record, setting, observed, terms):
 @pytest.mark.parametrize(
     "setting",
     [
-        config(preset="paper"),
+        config(preset="printed"),
         config(epsilon=5.0, cap=7),
         paced("ekf", boundary_inputs="private"),
         paced("random_walk", clip=20.0),
@@ -143,7 +143,7 @@ def test_scores_have_the_law_of_their_distance(setting, factor, record):
     "setting",
     [
         config(),
-        config(preset="paper"),
+        config(preset="printed"),
         paced("ekf"),
         paced("random_walk", boundary_inputs="private", unit="event"),
     ],

@@ -19,7 +19,7 @@ EVERYWHERE = ROAD.geometry.n_mainline
 @pytest.mark.parametrize(
     "setting",
     [
-        config(preset="paper"),
+        config(preset="printed"),
         config(3, adjacency="add_remove"),
         paced("ekf", boundary_inputs="private"),
         dataclasses.replace(paced(bandwidth=1), query_spans=(1, 2)),

@@ -15,7 +15,7 @@ from .small import HORIZON, ROAD, SECONDS, HalfTheLimit, config, paced, reached,
 # --- what a vehicle tells -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("preset", ["paper", "corrected", "capped"])
+@pytest.mark.parametrize("preset", ["printed", "corrected", "capped"])
 def test_moves_are_the_distance_of_a_second(preset, record):
     setting = config(preset=preset)
     planner, mu = Planner(setting), privacy_report(setting).mu
@@ -39,7 +39,7 @@ def test_moves_are_the_distance_of_a_second(preset, record):
         assert distance**2 == pytest.approx(np.sum(outside**2), rel=1e-2)
 
 
-@pytest.mark.parametrize("preset", ["paper", "capped"])
+@pytest.mark.parametrize("preset", ["printed", "capped"])
 def test_where_paths_meet_speeds_alone_tell(preset, record):
     setting = config(preset=preset)
     paths = tuple(Trajectory.constant(np.array([20]), 2, speed) for speed in (5.0, 140.0))

@@ -8,7 +8,7 @@ from agents.audit.report import audit_environment, audit_one_run
 from agents.audit.residuals import BATCH, ROUNDS, examine, residuals_of
 from agents.environments import make_config
 from dptse_env.parts import make_task
-from dptse_env.release import Capped, Paced, Paper
+from dptse_env.release import Capped, Paced, Printed
 from dptse_env.release.noise import Noise
 from dptse_env.traffic import RecordLibrary
 from tests.helpers import ROOT, SHORT
@@ -27,7 +27,7 @@ class Remembered(Noise):
         DRAWN.append((row, self._normal[row].copy()))
 
 
-@pytest.mark.parametrize("base", [Paper, Capped, Paced])
+@pytest.mark.parametrize("base", [Printed, Capped, Paced])
 def test_residuals_are_the_noise_of_what_was_released(base, record):
     DRAWN.clear()
     setting = config(preset=noisy(base, Remembered), estimator="ekf")

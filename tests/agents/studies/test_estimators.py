@@ -55,10 +55,10 @@ def test_figures_are_there_where_all_that_they_show_was_played(some, tmp_path):
 
 
 def test_losses_are_those_of_the_mean_over_faults(recorded):
-    healthy = pick(recorded, sensed("paper", "ekf"))["reward"].to_numpy()
-    cells = study.miscounting("paper", "ekf", *study.FACTORS)
+    healthy = pick(recorded, sensed("printed", "ekf"))["reward"].to_numpy()
+    cells = study.miscounting("printed", "ekf", *study.FACTORS)
     faulty = np.mean([pick(recorded, each)["reward"].to_numpy() for each in cells], axis=0)
-    found = study.loss(recorded, cells, sensed("paper", "ekf"))
+    found = study.loss(recorded, cells, sensed("printed", "ekf"))
     assert len(cells) == 6
     assert found.mean == pytest.approx(100.0 * (faulty.mean() / healthy.mean() - 1.0))
     assert found.low < found.mean < found.high
@@ -76,18 +76,18 @@ def test_sensors_alone_have_the_budget_that_they_are_said_to_have():
     assert mu_by_group(study.alone("paced", "ekf", study.PART))["sensors"] == pytest.approx(part)
     queries = sensed("paced", "ekf", sensors=study.QUERIES)
     assert mu_by_group(queries) == {"queries": pytest.approx(whole)}
-    assert study.alone("paper", "ekf") == study.alone("paper", "ekf", study.PART)
+    assert study.alone("printed", "ekf") == study.alone("printed", "ekf", study.PART)
 
 
 def test_faults_are_those_of_one_detector():
     high, low, without = (
-        study.sensed_cell(study.miscounting("paper", "ekf", fault)[1])
+        study.sensed_cell(study.miscounting("printed", "ekf", fault)[1])
         for fault in ("high", "low", study.WITHOUT)
     )
     assert high.keywords["detectors"]["factor"] == pytest.approx([1.0, 4.0 / 3.0, 1.0])
     assert low.keywords["detectors"]["factor"] == pytest.approx([1.0, 2.0 / 3.0, 1.0])
     assert corridor_of(without).fixed_sensors == (3, 11)
-    queries = study.sensed_cell(sensed("paper", "ekf", sensors=study.QUERIES))
+    queries = study.sensed_cell(sensed("printed", "ekf", sensors=study.QUERIES))
     assert corridor_of(queries).fixed_sensors == ()
 
 

@@ -18,7 +18,7 @@ from dptse_env.schedules import make_schedule
 from tests.helpers import SHORT
 
 FOLDER = Path(__file__).parents[3] / "results" / "guarantees"
-PAPER, BOTH = "`paper` noise", "`paced` − `capped`"
+PRINTED, BOTH = "`printed` noise", "`paced` − `capped`"
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +45,8 @@ def test_the_tables_are_those_of_the_rows(rows, tmp_path, monkeypatch):
     error = values(rows, priced("ekf", "event", epsilon=20.0).labels, DENSITY)
     assert line_of(text, "event")[-1] == format_interval(mean_interval(error))
     # For ε = 5, by both releases, and by densities alone.
-    assert line_of(text, f"{PAPER}: composed")[4] == "348"
-    assert line_of(text, f"{PAPER}: met 64 times, at least")[4] == "215"
+    assert line_of(text, f"{PRINTED}: composed")[4] == "348"
+    assert line_of(text, f"{PRINTED}: met 64 times, at least")[4] == "215"
 
 
 def test_a_cell_that_was_not_played_is_a_dash(rows, tmp_path):
@@ -74,7 +74,7 @@ def test_a_crossing_is_found_in_the_logarithm(values, place):
 
 
 def test_epsilon_is_that_of_the_sums_of_two_vehicles():
-    own = priced("ekf", PAPER, epsilon=1.0)
+    own = priced("ekf", PRINTED, epsilon=1.0)
     config = make_config(own.env, own.keywords)
     density_std, speed_std = (each.noise_std for each in privacy_report(config).releases)
     # sqrt(2 C) vehicles on 100 m, by hand, and sqrt(2 C) speed limits.

@@ -60,7 +60,7 @@ def test_a_verdict_follows_what_was_measured(
 
 @pytest.mark.parametrize("how", ["lacking", "of another version"])
 def test_what_cannot_be_compared_is_a_dash(rows, times, how):
-    mhe = (pl.col("estimator") == "mhe") & (pl.col("privacy") == "paper")
+    mhe = (pl.col("estimator") == "mhe") & (pl.col("privacy") == "printed")
     version = pl.when(mhe).then(pl.lit("0.0.0")).otherwise("version")
     rows = rows.filter(~mhe) if how == "lacking" else rows.with_columns(version=version)
     text = tables_of(by_cell(rows, times.clear()))

@@ -150,7 +150,7 @@ def test_every_round_tries_other_swaps_in_other_episodes(round_of_swaps):
 
 
 def test_without_budgets_nothing_is_spent():
-    swaps = tried("paper")[1]
+    swaps = tried("printed")[1]
     assert not swaps.spent.any()
     assert swaps.gain.any()
 
