@@ -124,7 +124,7 @@ class EnvConfig:
     corridor: Corridor = CORRIDORS["paper-highway"]
     estimator: Any = "ekf"
     backend: str = "compiled"
-    parameters: ARZParameters = field(default=load_parameters("paper"))
+    parameters: ARZParameters = field(default=load_parameters("published"))
     estimator_settings: Any = None
     bandwidth: Annotated[int, Interval(1, 1000)] = 5
     query_spans: tuple[Annotated[int, Interval(1, 1000)], ...] = (1,)

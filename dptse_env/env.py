@@ -126,7 +126,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `corridor`           | "paper-highway" | the road: a name, a mapping or a road file          |
     | `estimator`          | "ekf"           | or `ukf`, `enkf`, `mhe`, `recurrent`, ...           |
     | `backend`            | "compiled"      | or `reference`: textbook filters, an extra          |
-    | `parameters`         | "paper"         | of the traffic model: a name, a mapping, a file     |
+    | `parameters`         | "published"     | of the traffic model: a name, a mapping, a file     |
     | `estimator_settings` | None            | tuning of the estimator; None for what ships        |
     | `bandwidth`          | 5               | largest cost of the queries of a step               |
     | `query_spans`        | (1,)            | numbers of neighbouring segments of a query         |

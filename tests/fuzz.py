@@ -141,7 +141,7 @@ def one_of(names, rng):
 NAMES = {
     "corridor": [*CORRIDORS, "none.toml"],
     "estimator": [*ESTIMATORS],
-    "parameters": ["paper", "w99-3lane", "none.json"],
+    "parameters": ["published", "w99-3lane", "none.json"],
     "estimator_settings": [*available_settings(), "none.json"],
     "action": [*ACTION_ENCODINGS],
     "reward": [*REWARDS],

@@ -110,7 +110,7 @@ def test_incident_and_demand_by_name():
 
 def test_tuned_settings_are_found_by_estimator_parameters_privacy_and_road():
     for estimator, parameters, privacy in itertools.product(
-        ("ekf", "open_loop"), ("paper", "w99-3lane"), ("printed", "corrected")
+        ("ekf", "open_loop"), ("published", "w99-3lane"), ("printed", "corrected")
     ):
         keywords = {"estimator": estimator, "parameters": parameters, "privacy": privacy}
         settings = resolve("paper-highway", keywords).settings()

@@ -90,7 +90,7 @@ def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):
     write_corridor(road, ROAD.replaced(segment_length=(0.1,) * 7 + (0.04,)))
     message = r"short\.toml: corridor\.segment_length must be at least 0\.0567 km .*, got 0\.04 km"
     with pytest.raises(ValueError, match=message + ".* an estimator .*: random_walk, recurrent"):
-        make(str(road), parameters="paper")
+        make(str(road), parameters="published")
     table = {"estimator": "mhe", "estimator_settings": {"mhe": {"horizon": 1000}}}
     write_corridor(road, ROAD, table)
     with pytest.raises(ValueError, match=r"short\.toml: environment\.estimator_settings\.mhe\.hor"):
@@ -99,7 +99,7 @@ def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):
         make(str(road), **table)
     write_corridor(road, ROAD.replaced(segment_length=(0.1,) * 7 + (0.04,)))
     # A random walk does not step the model.
-    make(str(road), parameters="paper", estimator="random_walk").reset(seed=0)
+    make(str(road), parameters="published", estimator="random_walk").reset(seed=0)
 
 
 def test_a_ramp_that_is_too_short_is_named_as_the_file_has_it(tmp_path):
@@ -108,7 +108,7 @@ def test_a_ramp_that_is_too_short_is_named_as_the_file_has_it(tmp_path):
     with pytest.raises(
         ValueError, match=r"ramp\.toml: corridor\.ramp_length must be at least 0\.05"
     ):
-        make(str(tmp_path / "ramp.toml"), parameters="paper")
+        make(str(tmp_path / "ramp.toml"), parameters="published")
 
 
 @pytest.mark.filterwarnings("ignore:corridor.average_dwell, parameters")
@@ -151,7 +151,7 @@ MINE = {
     [
         (None, {}, "ekf-w99-3lane-paced"),
         (None, {"estimator": "random_walk", "privacy": "printed"}, "random_walk-w99-3lane-printed"),
-        ("paper", {"privacy": "corrected"}, "ekf-paper-corrected"),
+        ("published", {"privacy": "corrected"}, "ekf-published-corrected"),
     ],
 )
 def test_parameters_of_ones_own_keep_the_settings_of_those_they_come_from(source, keywords, name):
@@ -175,7 +175,9 @@ def test_parameters_of_ones_own_warn_of_nothing_where_settings_are_given_or_none
     gym.make(ID, parameters=MINE, estimator="open_loop")
     tuned = load_settings("ekf-w99-3lane-paced")
     assert given.unwrapped.config.settings() == dataclasses.replace(tuned, count_noise=0.5)
-    with pytest.raises(ValueError, match="derived_from must be one of paper, w99-3lane, got 'x'"):
+    with pytest.raises(
+        ValueError, match="derived_from must be one of published, w99-3lane, got 'x'"
+    ):
         gym.make(ID, parameters={**MINE, "derived_from": "x"})
 
 

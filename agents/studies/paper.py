@@ -93,7 +93,9 @@ RUN_TIME, SPACE_TIME = "run_time.parquet", "space_time.parquet"
 DPI = 90
 SETTINGS = {
     f"{privacy} noise, {parameters} parameters": {"parameters": parameters, "privacy": privacy}
-    for privacy, parameters in itertools.product(("printed", "corrected"), ("paper", "w99-3lane"))
+    for privacy, parameters in itertools.product(
+        ("printed", "corrected"), ("published", "w99-3lane")
+    )
 }
 """Choices that the paper leaves open, by name; each result is shown under all of them."""
 

@@ -129,7 +129,10 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
         tried.append(parameters)
         return bowl(parameters)
 
-    kept, start = tmp_path / "search.json", start_from(load_parameters("paper"), corridor, "mine")
+    kept, start = (
+        tmp_path / "search.json",
+        start_from(load_parameters("published"), corridor, "mine"),
+    )
     arguments = corridor, cell, (0,), start, 100.0, library, 60, kept
     monkeypatch.setattr(searching, "filter_error", error)
     with pytest.raises(KeyboardInterrupt):
@@ -235,7 +238,7 @@ def test_a_choice_changes_for_what_is_certainly_better(errors, chosen, tmp_path,
     ("table", "kept"),
     [
         ({"estimator": "asm"}, False),
-        ({"parameters": "paper"}, False),
+        ({"parameters": "published"}, False),
         ({"parameters": "fit/my-road.json"}, False),
         ({"parameters": "mine/my-road.json"}, True),
         ({"parameters": "fit/my-road.json", "estimator_settings": "fit/tuned.json"}, True),
@@ -247,7 +250,7 @@ def test_a_choice_of_yours_is_among_what_is_compared(table, kept, tmp_path):
     seeds = {"training": None, "validation": None, "test": None}
     for name in ("fit/my-road.json", "mine/my-road.json"):
         (tmp_path / name).parent.mkdir()
-        arz = dataclasses.replace(load_parameters("paper"), name="my-road")
+        arz = dataclasses.replace(load_parameters("published"), name="my-road")
         write_parameters(tmp_path / name, arz, {})
     settings = {"estimator": "ekf", "settings": {}, "provenance": {}}
     (tmp_path / "fit" / "tuned.json").write_text(json.dumps({"a": settings}))
@@ -306,7 +309,7 @@ SHORT = ROAD.replace("segment_length = 0.1", "segment_length = [0.1, 0.1, 0.04, 
         (SHORT, [], "my-road.toml: segment 2 of 0.04 km must be longer than 0.044 km at 140 km/h"),
         (ROAD.replace("90\n", "60\n", 2), [], "my-road.toml: duration must be more than the 60 s"),
         (ROAD, ["--test", "1000:1004"], "test must be traffic seeds in 2000..2999"),
-        (ROAD, ["--env", f'{ID} {{"parameters": "paper"}}'], "env.parameters must be left out"),
+        (ROAD, ["--env", f'{ID} {{"parameters": "published"}}'], "env.parameters must be left out"),
         (ROAD, ["--estimators", "kalman"], "estimator must be one of"),
     ],
 )

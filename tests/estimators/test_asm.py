@@ -21,7 +21,7 @@ from dptse_env.estimators.asm import (
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 from tests.helpers import UNEVEN, Stretch, compiled
-from tests.model.oracle import PAPER
+from tests.model.oracle import PUBLISHED
 
 from .helpers import Episodes, assert_same, run, show, simulate, started, step
 
@@ -192,14 +192,14 @@ def held_to_the_equations(episodes, settings, n_steps):
     ("release", "road"), [("speed", PAPER_HIGHWAY), ("flow", PAPER_HIGHWAY), ("rows", UNEVEN)]
 )
 def test_it_is_the_sum_over_all_values_that_its_equations_say(release, road):
-    episodes = simulate("paper", n_steps=60, noise=1.5, release=release, road=road)
+    episodes = simulate("published", n_steps=60, noise=1.5, release=release, road=road)
     held_to_the_equations(episodes, EstimatorSettings(asm=ASM), 60)
 
 
 # What it gives ------------------------------------------------------------------------------------
 
 
-def on_a_road(n_steps, observed, values, parameters=PAPER, **fields):
+def on_a_road(n_steps, observed, values, parameters=PUBLISHED, **fields):
     """An episode of values (T or 1, S, 2) whose inputs say of the ends what is measured first."""
     model = ARZModel(Stretch(**fields).road, parameters)
     S = model.n_segments
@@ -243,7 +243,7 @@ def test_changes_travel_with_the_wave_of_the_traffic(speed, wave, way):
 
 def test_a_mean_stays_when_nothing_follows_for_long():
     """Weights fall by exp(-10) each second, to less than the smallest number."""
-    episodes = simulate("paper", n_steps=200)
+    episodes = simulate("published", n_steps=200)
     smoother = started("asm", "compiled", episodes, smoothing(time=0.1, boundary_weight=0.0))
     run(smoother, episodes, range(12))
     nothing = np.zeros((1, 19), bool)
@@ -256,7 +256,7 @@ def test_a_mean_stays_when_nothing_follows_for_long():
     np.testing.assert_allclose(after.speed, before.speed, rtol=1e-9)
 
 
-@pytest.mark.parametrize("parameters", ["paper", "w99-3lane"])
+@pytest.mark.parametrize("parameters", ["published", "w99-3lane"])
 def test_the_density_of_an_entry_is_read_off_the_inputs(parameters):
     """Up to the critical one: of a congested entry the inputs say no more."""
     parameters = load_parameters(parameters)

@@ -91,7 +91,7 @@ def test_backends_take_the_same_steps(name, release, bounds, settings):
 
     The UKF amplifies it everywhere, its reference against itself as well.
     """
-    parameters = "paper" if bounds == "box" else "w99-3lane"
+    parameters = "published" if bounds == "box" else "w99-3lane"
     episodes = simulate(parameters, n_steps=100, release=release)
     tolerance = 1e-6 if (name, bounds) == ("ukf", "box") else 1e-9
     anew = (name, bounds) != ("ekf", "cone")
@@ -262,7 +262,7 @@ def test_the_speed_of_a_nearly_empty_segment_tells_nothing_of_its_density(backen
 @pytest.mark.parametrize("name", ["ekf", "ukf", "mhe"])
 def test_the_estimate_of_a_nearly_empty_road_is_the_models(name):
     """Below VACUUM a cell has the free speed, whatever its psi is."""
-    episodes = simulate("paper", n=8, n_steps=1)
+    episodes = simulate("published", n=8, n_steps=1)
     model = episodes.model
     estimator = started(name, "compiled", episodes, EstimatorSettings(bounds="box"))
     share = np.array([0.0, 0.5, 1.0, 1.0 + 1e-9, 2.0, 1e3, 1e10, 2e11]) * VACUUM

@@ -31,7 +31,7 @@ both_backends = pytest.mark.parametrize("backend", BACKENDS)
 )
 def test_it_takes_the_steps_of_its_reference(release, bounds, options):
     """Both draw the same numbers."""
-    parameters = "paper" if release == "speed" else "w99-3lane"
+    parameters = "published" if release == "speed" else "w99-3lane"
     episodes = simulate(parameters, n=2, n_steps=25, release=release)
     settings = EstimatorSettings(bounds=bounds, **OPTIONS[options])
     compiled, reference = (started("enkf", each, episodes, settings) for each in BACKENDS)

@@ -7,7 +7,7 @@ from dptse_env.estimators import linalg
 from dptse_env.model import ARZModel
 from dptse_env.traffic import PAPER_HIGHWAY
 from tests.helpers import compiled
-from tests.model.oracle import PAPER
+from tests.model.oracle import PUBLISHED
 
 add_product, factor, forward, is_covariance, mirror, apply, apply_transposed = (
     compiled(getattr(linalg, part))
@@ -22,7 +22,7 @@ pair_update, products, propagate, scalar_update, solve, solve_many = (
     )
 )  # fmt: skip
 
-MODEL = ARZModel(PAPER_HIGHWAY.road, PAPER, demand_states=True)
+MODEL = ARZModel(PAPER_HIGHWAY.road, PUBLISHED, demand_states=True)
 ROAD, N = MODEL.road, MODEL.n_states
 WIDTH = linalg.padded(N)
 

@@ -18,7 +18,7 @@ def mixing(*experts, **changes):
 
 @pytest.mark.parametrize("release", RELEASES)
 def test_experts_are_weighed_by_what_they_foretell(release):
-    episodes = simulate("paper", n=2, n_steps=25, noise=2.0, release=release)
+    episodes = simulate("published", n=2, n_steps=25, noise=2.0, release=release)
     model, settings, likelihoods = episodes.model, mixing(memory=20.0), np.zeros((3, 2))
     mixture = started("mixture", "compiled", episodes, settings)
     experts = [started(name, "compiled", episodes, settings) for name in EXPERTS]
@@ -82,13 +82,13 @@ def test_experts_are_two_or_more_others(experts, message):
 
 
 def test_an_expert_is_an_estimator_or_the_name_of_weights():
-    model = model_of("paper", "speed")
+    model = model_of("published", "speed")
     mixture = make_estimator("mixture", "compiled", model, 1, EstimatorSettings())
     assert [each.saved.source for each in mixture.experts] == ["highway-speeds", "roads-speeds"]
 
 
 def test_settings_that_an_expert_cannot_have_are_refused():
-    model = model_of("paper", "speed")
+    model = model_of("published", "speed")
     with pytest.raises(ValueError, match=r"weights must be a file or one of .*, got 'kf'"):
         make_estimator("mixture", "compiled", model, 1, mixing("asm", "kf"))
     bad = replace(mixing("asm", "mhe"), process_noise=(0.0, 0.01))

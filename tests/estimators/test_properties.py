@@ -19,7 +19,7 @@ from dptse_env.estimators import (
 )
 from dptse_env.model import ARZModel
 from tests.helpers import Stretch, fast_and_slow
-from tests.model.oracle import PAPER
+from tests.model.oracle import PUBLISHED
 
 from .helpers import (
     EVERY,
@@ -55,7 +55,7 @@ CASES = [(*each, "speed") for each in EVERY]
 CASES += [(name, "compiled", kind) for name in ESTIMATORS for kind in ("flow", "rows")]
 LEARNED = ("recurrent", "mixture")
 """Estimators whose estimates are those of trained weights."""
-MODEL = model_of("paper", "speed")
+MODEL = model_of("published", "speed")
 
 
 def over(without=(), fast=FAST, cases=CASES):
@@ -85,7 +85,7 @@ def steps_of(name, backend, many):
 def test_every_name_and_backend_follows_the_protocol(name, backend):
     """And measures as its model does."""
     for centre, second in ((None, 80.0), (40.0, 30.0 * (80.0 - 40.0))):
-        model = ARZModel(MODEL.road, PAPER, 0.5, centre)
+        model = ARZModel(MODEL.road, PUBLISHED, 0.5, centre)
         estimator, everyone = make_estimator(name, backend, model, 3), np.arange(3)
         states = model.states(np.full((3, 19), 30.0), np.full((3, 19), 80.0))
         np.testing.assert_allclose(estimator.model.measure(states)[..., 1], second)
@@ -130,7 +130,7 @@ from dptse_env.estimators import make_estimator
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY
 for backend in ("compiled", "reference"):
-    make_estimator("ekf", backend, ARZModel(PAPER_HIGHWAY.road, load_parameters("paper")), 1)
+    make_estimator("ekf", backend, ARZModel(PAPER_HIGHWAY.road, load_parameters("published")), 1)
     assert ("filterpy" in sys.modules) == (backend == "reference")
 """
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -154,18 +154,18 @@ def test_bad_measurements_are_named(changes, message):
         "sigma": np.ones(2),
         "centre": np.ones(5),
     }
-    model = ARZModel(Stretch(n_mainline=5).road, PAPER, centre=50.0)
+    model = ARZModel(Stretch(n_mainline=5).road, PUBLISHED, centre=50.0)
     with pytest.raises(ValueError, match=message):
         Measurement.of(model, **{**good, **changes})
 
 
 def test_what_a_measurement_leaves_out_is_filled_in_and_boundary_columns_are_left_out():
     observed, values, sigma = np.ones((2, 5), bool), np.zeros((2, 5, 2)), np.array([3.0, 4.0])
-    flows = ARZModel(Stretch(n_mainline=5).road, PAPER, centre=50.0)
+    flows = ARZModel(Stretch(n_mainline=5).road, PUBLISHED, centre=50.0)
     given = Measurement.of(flows, observed, values, sigma)
     np.testing.assert_array_equal(given.sigma, np.broadcast_to(sigma, (2, 5, 2)))
     np.testing.assert_array_equal(given.centre, np.full((2, 5), 50.0))
-    speeds = ARZModel(Stretch(n_mainline=5).road, PAPER)
+    speeds = ARZModel(Stretch(n_mainline=5).road, PUBLISHED)
     given = Measurement.of(speeds, observed, values, sigma, np.full(5, 7.0))
     assert np.isnan(given.centre).all()  # speeds have no centre
     more = np.ones((2, 7), bool), np.ones((2, 7, 2)), np.ones((2, 7, 2)), np.ones((2, 6))
@@ -225,7 +225,10 @@ def test_poor_starts_and_ten_times_the_noise_stay_finite_and_within_bounds(
     name, backend, release, bounds
 ):
     """From an empty road, and from a jam that stands."""
-    n_steps, parameters = steps_of(name, backend, 50), "paper" if bounds == "box" else "w99-3lane"
+    n_steps, parameters = (
+        steps_of(name, backend, 50),
+        "published" if bounds == "box" else "w99-3lane",
+    )
     episodes = simulate(parameters, n=2, n_steps=n_steps, noise=10.0, release=release)
     model = episodes.model
     start = model.states(np.array([[0.0], [1.0]]) * model.jam_density, np.zeros((2, 19)))

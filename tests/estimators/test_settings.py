@@ -30,13 +30,13 @@ from dptse_env.traffic import CORRIDORS
 
 GOOD = {
     "estimator": "mhe",
-    "parameters": "paper",
+    "parameters": "published",
     "privacy": "corrected",
     "settings": {"process_noise": [0.01, 0.02], "mhe": {"arrival_noise": [0.1, 0.2]}},
     "provenance": {"source": "a test"},
 }
 ENTRY = {key: GOOD[key] for key in ("estimator", "settings", "provenance")}
-FILE = {"mhe-paper-corrected": ENTRY}
+FILE = {"mhe-published-corrected": ENTRY}
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,8 @@ def test_shipped_sets_are_named_after_what_they_are_for():
     for name in available_settings():
         assert load_settings(name) != EstimatorSettings()
     with pytest.raises(
-        ValueError, match=r"^estimator_settings must be one of .*ekf-paper-printed.*, got 'ekf'$"
+        ValueError,
+        match=r"^estimator_settings must be one of .*ekf-published-printed.*, got 'ekf'$",
     ):
         load_settings("ekf")
 
@@ -110,7 +111,7 @@ def test_bad_settings_are_neither_written_nor_read(settings, message, tmp_path):
     ):
         write_settings(path, **{**GOOD, "settings": settings})
     assert not path.exists()
-    path.write_text(json.dumps({"mhe-paper-corrected": {**ENTRY, "settings": settings}}))
+    path.write_text(json.dumps({"mhe-published-corrected": {**ENTRY, "settings": settings}}))
     with pytest.raises(
         ValueError, match=rf"^{re.escape(str(path))}: estimator_settings\.{message}"
     ):

@@ -47,7 +47,7 @@ class TextbookWalk:
 
 @every_release
 def test_a_walk_is_a_kalman_filter_without_covariances(release):
-    episodes = simulate("paper", n_steps=40, noise=3.0, release=release)
+    episodes = simulate("published", n_steps=40, noise=3.0, release=release)
     model, close = episodes.model, {"rtol": 1e-7, "atol": 1e-9}
     walk = started("random_walk", "compiled", episodes, WALK)
     textbook, default = TextbookWalk(model, episodes.start), np.full((40, 1, 19), 51.0)
@@ -75,7 +75,7 @@ def test_a_walk_is_a_kalman_filter_without_covariances(release):
 
 def test_a_flow_of_a_segment_found_empty_tells_next_to_nothing_of_a_speed():
     """Its noise over a density of zero would be infinite, and the flow itself over it, too."""
-    episodes = simulate("paper", n_steps=1, release="flow")
+    episodes = simulate("published", n_steps=1, release="flow")
     empty = episodes.model.states(np.zeros((1, 19)), np.full((1, 19), 60.0))
     walk = started("random_walk", "compiled", episodes, start=empty)
     prior = walk.estimate()

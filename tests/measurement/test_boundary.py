@@ -159,7 +159,7 @@ def test_boundary_segments_are_released_at_every_step_and_drive_the_next():
 # --- the published demand -------------------------------------------------------------------------
 
 
-@pytest.fixture(params=["paper", "w99-3lane"])
+@pytest.fixture(params=["published", "w99-3lane"])
 def model(request):
     return ARZModel(PAPER_HIGHWAY.road, load_parameters(request.param))
 

@@ -12,9 +12,9 @@ from dptse_env.model.parameters import STANDING, VACUUM
 from dptse_env.utils.arrays import FloatArray
 from tests.helpers import UNEVEN, Stretch, make_channels
 
-PAPER = load_parameters("paper")
+PUBLISHED = load_parameters("published")
 W99 = load_parameters("w99-3lane")
-NO_RELAXATION = replace(PAPER, name="no relaxation", relaxation_time=float("inf"))
+NO_RELAXATION = replace(PUBLISHED, name="no relaxation", relaxation_time=float("inf"))
 
 CHANNELS = make_channels((0, 3, 4, 13, 16), (1, 2, 3, 2, 1))
 """Channels of the highway, of one to three segments."""

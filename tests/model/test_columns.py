@@ -15,7 +15,7 @@ from tests.helpers import UNEVEN, compiled, make_channels, pairwise
 
 from .oracle import (
     HIGHWAY,
-    PAPER,
+    PUBLISHED,
     ROADS,
     W99,
     Oracle,
@@ -30,7 +30,7 @@ advance_states, make_batch_scratch, measure_channel, project, project_states = m
 
 WIDTH = 104
 everywhere = pytest.mark.parametrize(
-    ("road", "parameters"), [(HIGHWAY, PAPER), (UNEVEN, W99)], ids=["highway", "uneven"]
+    ("road", "parameters"), [(HIGHWAY, PUBLISHED), (UNEVEN, W99)], ids=["highway", "uneven"]
 )
 
 
@@ -42,7 +42,7 @@ def advanced(model, states, inputs):
 
 
 @pytest.mark.parametrize(
-    ("road", "parameters", "demand"), pairwise(ROADS, [PAPER, W99], [False, True])
+    ("road", "parameters", "demand"), pairwise(ROADS, [PUBLISHED, W99], [False, True])
 )
 def test_advances_as_the_oracle(road, parameters, demand):
     """Also where the states fill no whole vectors."""

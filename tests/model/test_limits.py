@@ -13,7 +13,7 @@ from tests.helpers import UNEVEN, Stretch, pairwise
 from .oracle import (
     HIGHWAY,
     NO_RELAXATION,
-    PAPER,
+    PUBLISHED,
     STRAIGHT,
     W99,
     Oracle,
@@ -22,7 +22,7 @@ from .oracle import (
 )
 
 seeds = st.integers(0, 2**32 - 1)
-both_sets = pytest.mark.parametrize("parameters", [PAPER, W99], ids=lambda p: p.name)
+both_sets = pytest.mark.parametrize("parameters", [PUBLISHED, W99], ids=lambda p: p.name)
 PLAIN = Stretch(n_mainline=4)
 MERGE = Stretch(n_mainline=4, on_ramps=(2,), ramp_lanes=3)
 DIVERGE = Stretch(n_mainline=4, off_ramps=(2,), exit_shares=(0.1,))
@@ -59,7 +59,7 @@ def test_a_uniform_road_relaxes_by_the_closed_form(parameters, filling, w_share)
         states = model.step(states, inputs)
 
 
-V_F, JAM, GAMMA = PAPER.free_flow_speed, PAPER.jam_density, PAPER.gamma
+V_F, JAM, GAMMA = PUBLISHED.free_flow_speed, PUBLISHED.jam_density, PUBLISHED.gamma
 # (density [veh/km], speed [km/h]) left and right of the middle of a road of 4 km.
 RIEMANN = {
     "shock and contact": ((60.0, 80.0), (150.0, 20.0)),
@@ -123,7 +123,7 @@ def test_converges_to_the_exact_solution_of_the_riemann_problem(left, right):
 
 
 @pytest.mark.parametrize(
-    ("road", "parameters"), pairwise([HIGHWAY, UNEVEN], [PAPER, W99, NO_RELAXATION])
+    ("road", "parameters"), pairwise([HIGHWAY, UNEVEN], [PUBLISHED, W99, NO_RELAXATION])
 )
 @given(seed=seeds)
 def test_what_the_road_holds_changes_by_what_passes_its_ends(road, parameters, seed):
@@ -169,17 +169,17 @@ def test_density_stays_positive_and_w_within_its_bounds(road, parameters, seed, 
 
 
 def test_an_empty_road_stays_empty_and_finite():
-    model = ARZModel(HIGHWAY.road, PAPER)
+    model = ARZModel(HIGHWAY.road, PUBLISHED)
     states = np.zeros((1, model.n_states))
     inputs = model.boundary_inputs(np.zeros((1, 6)), np.full((1, 6), np.nan))
     np.testing.assert_array_equal(model.step(states, inputs), states)
     assert np.all(np.isfinite(model.jacobian(states, inputs)))
-    np.testing.assert_array_equal(model.speed(states), PAPER.free_flow_speed)
+    np.testing.assert_array_equal(model.speed(states), PUBLISHED.free_flow_speed)
 
 
 @given(seed=seeds)
 def test_a_merge_with_an_empty_ramp_and_a_diverge_that_nobody_takes_are_plain_faces(seed):
-    merge, plain = ARZModel(MERGE.road, PAPER), ARZModel(PLAIN.road, PAPER)
+    merge, plain = ARZModel(MERGE.road, PUBLISHED), ARZModel(PLAIN.road, PUBLISHED)
     states, inputs = drawn(merge, seed)
     states[:, 8:], inputs[:, 3] = 0.0, 0.0
     straight, merged = plain.step(states[:, :8], inputs[:, :3]), merge.step(states, inputs)
@@ -187,6 +187,6 @@ def test_a_merge_with_an_empty_ramp_and_a_diverge_that_nobody_takes_are_plain_fa
     np.testing.assert_array_equal(merged[:, 8:], 0.0)
     states[:, 8:] = 30.0, 30.0 * 102.0  # a ramp that takes in something, however little
     for share, atol in ((0.0, 1e-7), (1e-12, 1e-4)):
-        diverge = ARZModel(replace(DIVERGE, exit_shares=(share,)).road, PAPER)
+        diverge = ARZModel(replace(DIVERGE, exit_shares=(share,)).road, PUBLISHED)
         through = diverge.step(states, inputs[:, [0, 1, 2, 3]])
         np.testing.assert_allclose(through[:, :8], straight, rtol=1e-9, atol=atol)

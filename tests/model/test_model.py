@@ -7,9 +7,9 @@ from dptse_env.model import ARZModel
 from dptse_env.model.parameters import MEASUREMENT_FLOOR
 from tests.helpers import pairwise
 
-from .oracle import CHANNELS, HIGHWAY, PAPER, W99, random_states
+from .oracle import CHANNELS, HIGHWAY, PUBLISHED, W99, random_states
 
-both_sets = pytest.mark.parametrize("parameters", [PAPER, W99], ids=lambda p: p.name)
+both_sets = pytest.mark.parametrize("parameters", [PUBLISHED, W99], ids=lambda p: p.name)
 
 
 @both_sets
@@ -34,7 +34,7 @@ def test_measures_density_and_speed_of_segments_or_averages_of_flows_around_a_ce
 
 @pytest.mark.parametrize(
     ("parameters", "release", "demand"),
-    pairwise([PAPER, W99], ["speeds", "flows", "rows"], [False, True]),
+    pairwise([PUBLISHED, W99], ["speeds", "flows", "rows"], [False, True]),
 )
 def test_the_measurement_matrix_is_that_of_central_differences(parameters, release, demand):
     speed = None if release == "speeds" else 51.0
@@ -60,7 +60,7 @@ def test_the_measurement_matrix_is_that_of_central_differences(parameters, relea
 def test_impossible_sensors_are_refused():
     for bad in (-1.0, np.nan, np.inf, "fast"):
         with pytest.raises(ValueError, match=r"model\.centre must be .*, got "):
-            ARZModel(HIGHWAY.road, PAPER, centre=bad)
+            ARZModel(HIGHWAY.road, PUBLISHED, centre=bad)
     with pytest.raises(ValueError, match=r"model\.channels must be segments"):
         ARZModel(HIGHWAY.road, W99, channels=CHANNELS)  # mean speeds have no sum
 
@@ -85,7 +85,7 @@ def test_the_cone_holds_speed_and_w_and_leaves_what_is_inside_alone(parameters):
 
 
 def test_the_box_is_the_papers_and_factors_have_bounds_of_their_own():
-    model = ARZModel(HIGHWAY.road, PAPER, demand_states=True)
+    model = ARZModel(HIGHWAY.road, PUBLISHED, demand_states=True)
     assert (model.n_demand_states, model.n_states) == (3, 41)
     np.testing.assert_array_equal(model.state_scale[-3:], np.ones(3))
     wild = np.random.default_rng(3).normal(0.0, 3.0, (200, 41)) * model.state_scale
@@ -102,7 +102,7 @@ def test_the_box_is_the_papers_and_factors_have_bounds_of_their_own():
 
 
 def test_boundary_inputs_follow_the_order_of_the_input_vector():
-    model = ARZModel(HIGHWAY.road, PAPER)
+    model = ARZModel(HIGHWAY.road, PUBLISHED)
     jam = model.arz.jam[model.road.entry_cells]
     np.testing.assert_allclose(jam, [333.0, 111.0, 111.0])
     density = np.array([[30.0, 40.0, 6.0, 7.0, 8.0, 9.0]])
@@ -116,7 +116,7 @@ def test_boundary_inputs_follow_the_order_of_the_input_vector():
 
 def test_a_boundary_cell_demands_its_capacity_or_nothing_and_w_keeps_the_cfl_condition():
     def inputs(density, speed):
-        return ARZModel(HIGHWAY.road, PAPER).boundary_inputs(
+        return ARZModel(HIGHWAY.road, PUBLISHED).boundary_inputs(
             np.full((1, 6), density), np.full((1, 6), speed)
         )[0]
 

@@ -15,7 +15,7 @@ from dptse_env.model.parameters import (
 from dptse_env.utils.validation import from_mapping
 from tests.helpers import UNEVEN
 
-from .oracle import HIGHWAY, PAPER
+from .oracle import HIGHWAY, PUBLISHED
 
 GOOD = {
     "name": "x",
@@ -27,11 +27,11 @@ GOOD = {
 
 
 def test_named_sets_hold_their_published_values():
-    assert available_parameters() == ("paper", "w99-3lane")
-    assert load_parameters("paper") == ARZParameters("paper", 102.0, 333.0, 2.0, 60.0, 3)
+    assert available_parameters() == ("published", "w99-3lane")
+    assert load_parameters("published") == ARZParameters("published", 102.0, 333.0, 2.0, 60.0, 3)
     assert load_parameters("w99-3lane") == ARZParameters("w99-3lane", 140.0, 400.0, 0.45, 50.0, 3)
-    with pytest.raises(ValueError, match="must be one of paper, w99-3lane, got 'papers'"):
-        load_parameters("papers")
+    with pytest.raises(ValueError, match="must be one of published, w99-3lane, got 'paper'"):
+        load_parameters("paper")
 
 
 @pytest.mark.parametrize(
@@ -70,20 +70,20 @@ def test_written_set_reads_back_with_its_provenance(tmp_path):
 
 @pytest.mark.parametrize("time_step", [1.77, 0.0, -1.0, float("nan")])
 def test_a_step_too_long_names_the_longest_admissible(time_step):
-    model = ARZModel(HIGHWAY.road, PAPER, time_step)
+    model = ARZModel(HIGHWAY.road, PUBLISHED, time_step)
     with pytest.raises(ValueError, match=r"CFL condition needs a time step > 0 and at most 1.76 s"):
         model.dynamics  # noqa: B018
-    assert ARZModel(HIGHWAY.road, PAPER, 1.76).dynamics[1].relaxation > 0
+    assert ARZModel(HIGHWAY.road, PUBLISHED, 1.76).dynamics[1].relaxation > 0
 
 
 def test_strong_relaxation_a_large_gamma_and_the_shortest_segment_bound_the_step_too():
     for parameters, road, message in (
-        (replace(PAPER, relaxation_time=0.5), HIGHWAY, r"must be longer .* at most 0.43 s"),
-        (replace(PAPER, gamma=4.0), HIGHWAY, r"at most 0.88 s"),
-        (PAPER, UNEVEN, r"at least (0\.\d+) km .*, got 0\.08 km"),
+        (replace(PUBLISHED, relaxation_time=0.5), HIGHWAY, r"must be longer .* at most 0.43 s"),
+        (replace(PUBLISHED, gamma=4.0), HIGHWAY, r"at most 0.88 s"),
+        (PUBLISHED, UNEVEN, r"at least (0\.\d+) km .*, got 0\.08 km"),
     ):
         with pytest.raises(ValueError, match=message) as refused:
             ARZModel(road.road, parameters, 1.6).require_time_step()
     # The shortest segment that is named is admissible, and none that is shorter.
     least = float(re.findall(r"at least (0\.\d+) km", str(refused.value))[0])
-    assert PAPER.largest_time_step(least - 1e-4) < 1.6 <= PAPER.largest_time_step(least)
+    assert PUBLISHED.largest_time_step(least - 1e-4) < 1.6 <= PUBLISHED.largest_time_step(least)

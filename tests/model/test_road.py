@@ -7,7 +7,7 @@ from dptse_env.model import ARZModel
 from dptse_env.road import DIVERGE, EXIT, LINK, MERGE
 from tests.helpers import make_channels
 
-from .oracle import CHANNELS, HIGHWAY, PAPER
+from .oracle import CHANNELS, HIGHWAY, PUBLISHED
 
 
 def test_the_papers_highway_has_the_orders_of_state_and_input():
@@ -39,10 +39,10 @@ def test_the_papers_highway_has_the_orders_of_state_and_input():
 
 def test_a_channel_is_the_average_of_its_segments():
     values = np.random.default_rng(0).normal(size=(4, 19, 2))
-    averages = ARZModel(HIGHWAY.road, PAPER, 1.0, 51.0, CHANNELS).averages(values)
+    averages = ARZModel(HIGHWAY.road, PUBLISHED, 1.0, 51.0, CHANNELS).averages(values)
     for m, (first, span) in enumerate(zip(CHANNELS.first, CHANNELS.span, strict=True)):
         np.testing.assert_allclose(averages[:, m], values[:, first : first + span].mean(axis=1))
-    single = ARZModel(HIGHWAY.road, PAPER, 1.0, 51.0)
+    single = ARZModel(HIGHWAY.road, PUBLISHED, 1.0, 51.0)
     np.testing.assert_array_equal(single.averages(values), values)
 
 
@@ -50,4 +50,4 @@ def test_a_channel_is_the_average_of_its_segments():
 def test_a_channel_off_the_road_is_refused(first, span):
     channels = make_channels((0, first), (1, span))
     with pytest.raises(ValueError, match=r"model\.channels must cover segments in 0\.\.18"):
-        ARZModel(HIGHWAY.road, PAPER, 1.0, 51.0, channels)
+        ARZModel(HIGHWAY.road, PUBLISHED, 1.0, 51.0, channels)

@@ -16,7 +16,7 @@ from .oracle import (
     CHANNELS,
     HIGHWAY,
     NO_RELAXATION,
-    PAPER,
+    PUBLISHED,
     ROADS,
     STRAIGHT,
     W99,
@@ -30,7 +30,8 @@ advance, make_scratch, write_channel = map(compiled, (advance, make_scratch, wri
 
 
 @pytest.mark.parametrize(
-    ("road", "parameters", "demand"), pairwise(ROADS, [PAPER, W99, NO_RELAXATION], [False, True])
+    ("road", "parameters", "demand"),
+    pairwise(ROADS, [PUBLISHED, W99, NO_RELAXATION], [False, True]),
 )
 @example(seed=405074828)  # a gap w - v of one rounding, whose power has a steep derivative
 @given(seed=st.integers(0, 2**32 - 1))
@@ -53,7 +54,7 @@ def test_equals_the_oracle(road, parameters, demand, seed):
 
 def test_standing_traffic_takes_the_derivative_of_moving_traffic():
     """The cone's edge v = 0 is a kink; rounding must not choose the side."""
-    model = ARZModel(STRAIGHT.road, PAPER)
+    model = ARZModel(STRAIGHT.road, PUBLISHED)
     at_rest = model.states(np.full((1, 15), 200.0), np.zeros((1, 15)))
     inputs = np.array([[1000.0, 102.0, 150.0]])
     below, at, above = (model.jacobian(at_rest * (1.0 + e), inputs) for e in (-1e-14, 0.0, 1e-14))

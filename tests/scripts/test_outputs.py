@@ -28,7 +28,7 @@ COMMANDS = {
     "evaluate": (["--env", SHORT, *ONE], "tables.md"),
     "train": (["--env", SHORT, "--steps", "100", *ONE], "best.safetensors"),
     "train-estimator": (SMALL, "weights-flows.safetensors"),
-    "tune": (["--env", SHORT, "--estimators", "random_walk"], "random_walk-paper-printed.json"),
+    "tune": (["--env", SHORT, "--estimators", "random_walk"], "random_walk-published-printed.json"),
     "suite": (["speed-front", "--cells", "short", *ONE], "card.json"),
     "study": (["examples.my_study:STUDY", *ONE], "tables.md"),
     "fit": (["road.toml", *ONE], "page.html"),

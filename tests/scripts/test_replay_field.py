@@ -25,7 +25,7 @@ def test_a_row_for_each_estimator(tmp_path):
     usual = scores()
     assert set(usual["ekf"]) == {"error", "density", "speed", "chi2_density", "chi2_speed"}
     assert scores("--settings", "ekf-w99-3lane-corrected") == usual
-    assert scores("--parameters", "paper")["ekf"]["error"] != usual["ekf"]["error"]
+    assert scores("--parameters", "published")["ekf"]["error"] != usual["ekf"]["error"]
     assert scores("--epsilon", "50")["ekf"]["error"] < usual["ekf"]["error"]
     assert scores("--bandwidth", "1") != usual
     assert scores("--preset", "printed")["ekf"]["error"] < usual["ekf"]["error"]
@@ -45,7 +45,7 @@ def test_what_does_not_suit_a_field_is_refused(tmp_path):
     assert "bandwidth must be" in refused(*words, "--bandwidth", "5")
     # 50 m: too short for the EKF with these parameters, and what may be done is said.
     short = [*words[: words.index("--segments")], "--segments", "6", *words[-4:]]
-    line = refused(*short, "--parameters", "paper", "--estimators", "random_walk", "ekf")
+    line = refused(*short, "--parameters", "published", "--estimators", "random_walk", "ekf")
     assert "segments must be fewer, got 6: corridor.segment_length must be at least 0.0567" in line
     assert "random_walk" in line.partition(" an estimator that does not step the model: ")[2]
     assert "parameters must be" in refused(*words, "--parameters", "mine")

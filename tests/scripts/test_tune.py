@@ -15,7 +15,7 @@ def test_it_leaves_a_set_per_configuration(tmp_path, capsys):
     main(args)
     printed = capsys.readouterr().out.splitlines()
     for privacy, line in zip(("printed", "corrected"), printed[-2:], strict=True):
-        name = f"random_walk-paper-{privacy}"
+        name = f"random_walk-published-{privacy}"
         content = json.loads((tmp_path / f"{name}.json").read_text())[name]
         assert set(content["settings"]) == {"walk_noise"}
         assert content["provenance"]["n_trials"] == 3
@@ -24,8 +24,8 @@ def test_it_leaves_a_set_per_configuration(tmp_path, capsys):
         assert list(env.config.settings().walk_noise) == content["settings"]["walk_noise"]
         keywords["estimator_settings"] = str(tmp_path / f"{name}.json")
         assert env.config == gym.make(SHORT, privacy=privacy, **keywords).unwrapped.config
-    (tmp_path / "random_walk-paper-printed.journal").unlink()
-    with pytest.raises(ValueError, match=r"random_walk-paper-printed\.json"):
+    (tmp_path / "random_walk-published-printed.journal").unlink()
+    with pytest.raises(ValueError, match=r"random_walk-published-printed\.json"):
         main(args)
 
 
@@ -36,13 +36,13 @@ def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
         "scripts.dptse", "tune", "--env", SHORT, "--estimators", "ekf", "--seeds", "0:2",
         "--trials", "16", "--workers", "2", "--output", tmp_path,
     )  # fmt: skip
-    journal = tmp_path / "ekf-paper-printed.journal"
+    journal = tmp_path / "ekf-published-printed.journal"
     assert run_killed("agents.executors:tqdm", "update", 4, *words).returncode == -9
     n = finished(journal)
     assert 4 <= n < 16
-    assert not (tmp_path / "ekf-paper-printed.json").exists()
+    assert not (tmp_path / "ekf-published-printed.json").exists()
     assert run_killed("agents.executors:tqdm", "update", 17 - n, *words).returncode == 0
-    (content,) = json.loads((tmp_path / "ekf-paper-printed.json").read_text()).values()
+    (content,) = json.loads((tmp_path / "ekf-published-printed.json").read_text()).values()
     assert content["provenance"]["n_trials"] == finished(journal) == 16
 
 
@@ -57,7 +57,7 @@ def finished(journal):
     [
         ({"workers": 0}, "workers must be an integer >= 1, got 0"),
         ({"trials": 0}, "trials must be an integer >= 1, got 0"),
-        ({"estimators": ("ekf", "ekf")}, "ekf-paper-printed must be tuned once"),
+        ({"estimators": ("ekf", "ekf")}, "ekf-published-printed must be tuned once"),
         ({"estimators": ()}, "must not be empty"),
         ({"seeds": "2000:2008"}, "seeds must be traffic seeds"),
     ],
