@@ -42,7 +42,7 @@ SPACE: dict[str, dict[str, Knob]] = {
         **_PROCESS_NOISE,
         "mhe.arrival_noise.0": evenly(3e-3, 0.2),
         "mhe.arrival_noise.1": evenly(3e-3, 0.2),
-        "mhe.linearisation": CategoricalDistribution(("paper", "trajectory")),
+        "mhe.linearisation": CategoricalDistribution(("published", "trajectory")),
         "mhe.bounds": CategoricalDistribution(("box", "cone")),
     },
     "random_walk": _WALK_NOISE,

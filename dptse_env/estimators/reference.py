@@ -425,7 +425,7 @@ class _Stage:
 
     predicted: FloatArray  # (n_x,)
     solution: FloatArray  # (n_x,)
-    point: FloatArray  # (n_x,) where "paper" linearises the measurement
+    point: FloatArray  # (n_x,) where "published" linearises the measurement
     seen: Measurement | None = None
     R: FloatArray = field(default_factory=lambda: np.zeros(0))  # (2 m,)
     C: FloatArray = field(init=False)  # (2 m, n_x)
@@ -459,7 +459,7 @@ class _Window(EpisodeFilter):
         after = problem.f(problem.project(self.x[None], "cone"), u)
         self.x = problem.project(after)[0]
         self.stages.append(_Stage(self.x, self.x, mean))
-        if self.mhe.linearisation == "paper":
+        if self.mhe.linearisation == "published":
             self._linearise_step(before, mean)
         if len(self.stages) > self.mhe.horizon + 1:
             self.stages.pop(0)
@@ -473,7 +473,7 @@ class _Window(EpisodeFilter):
         stage.seen = Measurement(observed.copy(), values.copy(), sigma.copy(), centre.copy())
         self.has_failed = False
         stage.R = self.problem.R(self.x, seen, LEAST_DEVIATION)
-        if self.mhe.linearisation == "paper":
+        if self.mhe.linearisation == "published":
             self._linearise_measurement(stage, stage.point)
         else:
             for each in self.stages:

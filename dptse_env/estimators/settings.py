@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal
 from dptse_env.model import Bounds
 from dptse_env.utils.validation import Interval, checked_fields, shown
 
-Linearisation = Literal["paper", "trajectory"]
+Linearisation = Literal["published", "trajectory"]
 
 PATH = "estimator_settings"
 """Their place in error messages."""
@@ -87,15 +87,15 @@ class HorizonSettings(_Checked, path=f"{PATH}.mhe"):
             3,000.
         arrival_noise: Standard deviations of the predicted state at the window's start, of rho
             over rho_m and psi over rho_m v_f.
-        linearisation: `paper`: each stage once, when it enters the window, at the mean of the last
-            solution; `trajectory`: all stages at every step along the last solution.
+        linearisation: `published`: each stage once, when it enters the window, at the mean of the
+            last solution; `trajectory`: all stages at every step along the last solution.
         bounds: `box`, the paper's, or `cone`: the smallest box around the cone of physical states
             bounds the program, and its last state is projected into the cone.
     """
 
     horizon: Annotated[int, Interval(1, 1000)] = 10
     arrival_noise: tuple[ArrivalDeviation, ArrivalDeviation] = (0.03, 0.03)
-    linearisation: Linearisation = "paper"
+    linearisation: Linearisation = "published"
     bounds: Bounds = "box"
 
 

@@ -125,7 +125,7 @@ def test_ekf_and_ukf_are_the_kalman_filter(name, sensor, backend):
 
 @pytest.mark.parametrize(
     ("backend", "sensor", "linearisation"),
-    pairwise(BACKENDS, SENSORS, ["paper", "trajectory"], n=4),
+    pairwise(BACKENDS, SENSORS, ["published", "trajectory"], n=4),
 )
 def test_the_mhe_ends_where_the_kalman_filter_does_while_its_window_grows(
     backend, sensor, linearisation

@@ -59,7 +59,7 @@ def agree(compiled, reference, tolerance):
 @pytest.mark.parametrize(
     ("release", "bounds", "linearisation", "settings", "horizon"),
     pairwise(
-        ["rows", "flow", "speed", "uneven"], ["cone", "box"], ["paper", "trajectory"],
+        ["rows", "flow", "speed", "uneven"], ["cone", "box"], ["published", "trajectory"],
         [RICH, PLAIN], [4, 1],
     ),
 )  # fmt: skip
@@ -88,7 +88,7 @@ def test_backends_agree(release, bounds, linearisation, settings, horizon):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("release", "linearisation", "tolerance"),
-    [("speed", "paper", 1e-9), ("speed", "trajectory", 1e-8), ("flow", "paper", 1e-9)],
+    [("speed", "published", 1e-9), ("speed", "trajectory", 1e-8), ("flow", "published", 1e-9)],
 )
 def test_backends_agree_over_a_recorded_episode(release, linearisation, tolerance):
     """Rounding is all: H has a condition of 1e7, and along the trajectory it feeds back."""
@@ -100,7 +100,7 @@ def test_backends_agree_over_a_recorded_episode(release, linearisation, toleranc
         agree(*both, tolerance)
 
 
-@pytest.mark.parametrize("linearisation", ["paper", "trajectory"])
+@pytest.mark.parametrize("linearisation", ["published", "trajectory"])
 def test_the_references_program_is_the_papers_objective(linearisation):
     """z' H z + q' z is the sum of eq. 14 but for a constant, over stages with rows and counts."""
     episodes, rng = simulate(n_steps=6, release="rows"), np.random.default_rng(1)
@@ -134,8 +134,8 @@ def test_the_references_program_is_the_papers_objective(linearisation):
 POOR = [
     ("trajectory", "box", 1.0, "speed", 20),  # gradients are sums of large numbers that cancel
     ("trajectory", "cone", 0.0, "flow", 5),
-    ("paper", "box", 0.0, "speed", 1),
-    ("paper", "cone", 1.0, "flow", 5),
+    ("published", "box", 0.0, "speed", 1),
+    ("published", "cone", 1.0, "flow", 5),
 ]
 
 
@@ -143,7 +143,7 @@ POOR = [
     ("linearisation", "bounds", "filling", "release", "horizon"),
     fast_and_slow(
         product(
-            ["paper", "trajectory"], ["box", "cone"], [0.0, 1.0], ["speed", "flow"], [1, 5, 20]
+            ["published", "trajectory"], ["box", "cone"], [0.0, 1.0], ["speed", "flow"], [1, 5, 20]
         ),
         POOR,
     ),
