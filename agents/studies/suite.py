@@ -111,7 +111,7 @@ def _cell(
 CELLS = {
     "short": _cell(SHORT, 1, _EKF),
     "short-paced": _cell(SHORT, 1, _RECURRENT, _SHORT_PACED),
-    "paper": _cell(PAPER, 5, _EKF),
+    "printed": _cell(PAPER, 5, _EKF),
     "capped": _cell(PRIVATE, 5, _EKF, {"privacy": "capped"}),
     "paced": _cell(PRIVATE, 1, _EKF),
     "paced-recurrent": _cell(PRIVATE, 1, _RECURRENT),

@@ -143,12 +143,12 @@ SETTINGS = {
     "long-recurrent": Setting(
         "LongHighway-v0, recurrent, B = 2", LONG, _RECURRENT, LONG_TRAFFIC, LONG_CHANGES
     ),
-    "paper": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED),
+    "capped": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED),
 }
 SHIPPED = {
     "short": "short-highway", "short-paced": "short-highway-paced",
     **dict.fromkeys(("private-1", "private-2", "long"), "private-highway"),
-    "paper": "paper-highway-capped",
+    "capped": "paper-highway-capped",
 }  # fmt: skip
 """Policies that come with the package, by setting: `PLACKETT_LUCE` after nine minutes, not one."""
 CURVES = "curves.parquet"
