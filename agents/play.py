@@ -208,7 +208,7 @@ def record(
     """
     library: RecordLibrary = open_library(records)
     missing = library.missing(corridor, seeds)
-    if not missing or corridor.source.recordings is not None:
+    if not missing or corridor.recordings is not None:
         return
     with FileLock(library.prepare(corridor, missing[0]) / ".lock"):
         library.ensure(corridor, seeds, workers, progress)

@@ -284,7 +284,7 @@ def _privacy(path: str, value: Any, base: PrivacySettings, corridor: Corridor) -
         value = from_mapping(type(base), {**given, "preset": preset}, path, base)
     model = RELEASE_MODELS.find(value.preset)
     blind = "one that needs no vehicles, as 'printed', on a road of measured fields"
-    is_served = has_vehicles(corridor.source.recordings) or not model.needs_vehicles
+    is_served = has_vehicles(corridor.recordings) or not model.needs_vehicles
     require(is_served, f"{path}.preset", blind, RELEASE_MODELS.name_of(value.preset))
     own = f"'seeded' {_with_model(value)}, whose noise is its own"
     require(value.noise == "seeded" or model.takes_noise, f"{path}.noise", own, value.noise)
@@ -301,7 +301,7 @@ def _penetration(
     """Return the connected vehicles; a number, or a pair of numbers, is their share."""
     fields = value if isinstance(value, Mapping | Penetration) else {"share": value}
     found: Penetration = _typed(path, fields, base)
-    whole = found.is_complete or has_vehicles(corridor.source.recordings)
+    whole = found.is_complete or has_vehicles(corridor.recordings)
     require(whole, f"{path}.share", "1 on a road of measured fields", found.share)
     alike = f"1 {_with_model(privacy)}, which knows of no groups of channels"
     is_served = found.is_complete or RELEASE_MODELS.find(privacy.preset).knows_groups
@@ -318,7 +318,7 @@ def _detectors(
     each = f"one number, or one for each of the {n} fixed sensors"
     require(not isinstance(factor, tuple) or len(factor) == n, f"{path}.factor", each, factor)
     exact = "left out on a road without fixed sensors, and on one of measured fields"
-    has_any = n > 0 and has_vehicles(corridor.source.recordings)
+    has_any = n > 0 and has_vehicles(corridor.recordings)
     require(has_any or found == Detectors(), path, exact, found)
     alike = f"left out {_with_model(privacy)}, which knows of no groups of channels"
     is_served = found == Detectors() or RELEASE_MODELS.find(privacy.preset).knows_groups
@@ -440,17 +440,17 @@ def _seeds(path: str, value: Any, base: Any, corridor: Corridor) -> tuple[int, .
     n = len(seeds)
     require(1 <= n <= MOST_SEEDS, path, f"1 to {MOST_SEEDS} seeds", f"{n} of them")
     require(len(set(seeds)) == n, path, "distinct", seeds)
-    if corridor.source.recordings is not None:
-        require_seeds(corridor.source.recordings, seeds, path)
+    if corridor.recordings is not None:
+        require_seeds(corridor.recordings, seeds, path)
     return seeds
 
 
 def _recorded_seeds(base: tuple[int, ...], corridor: Corridor) -> tuple[int, ...]:
     """Return the preset's traffic seeds, or all of training that were recorded on the road."""
-    if corridor.source.recordings is None:
+    if corridor.recordings is None:
         return base
     return tuple(
-        seed for seed in recorded_seeds(corridor.source.recordings) if seed in TRAINING_SEEDS
+        seed for seed in recorded_seeds(corridor.recordings) if seed in TRAINING_SEEDS
     )
 
 

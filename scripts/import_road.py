@@ -300,7 +300,7 @@ def print_next(
 def describe(road: ImportedRoad) -> str:
     """Describe a road of a SUMO net in a few lines."""
     corridor, names = road.corridor, road.segments.names
-    geometry, files = corridor.geometry, corridor.source.sumo
+    geometry, files = corridor.geometry, corridor.sumo
     assert files is not None
     n, n_on = geometry.n_mainline, geometry.n_on_ramps
     lengths, lanes, limits = (

@@ -173,7 +173,7 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
         keywords["bandwidth"] = third
         decided.append("bandwidth")
         remarks.append(f"bandwidth {third}, a third of the segments")
-    is_field = not has_vehicles(corridor.source.recordings)
+    is_field = not has_vehicles(corridor.recordings)
     needs_vehicles = base.release_model.needs_vehicles
     if is_field and needs_vehicles and "privacy" not in keywords:
         keywords["privacy"] = "corrected"
@@ -198,7 +198,7 @@ def _lies_in(value: Any, folder: Path) -> bool:
 
 def _check_road(path: Path, corridor: Corridor) -> None:
     """Refuse a road without traffic or SUMO files, and segments that suit no set of parameters."""
-    if corridor.source.recordings is None and corridor.source.sumo is None:
+    if corridor.recordings is None and corridor.sumo is None:
         rates = [rate for _, rate in corridor.conditions.published_demand.mainline]
         require(max(rates) > 0.0, f"{path}: demand.mainline", "above 0 veh/h at some time", rates)
         net_xml(corridor.geometry)  # so that netconvert refuses the road, or is missing, at once
@@ -217,9 +217,7 @@ def _seeds_of(
     path: Path, corridor: Corridor, given: Mapping[str, str | None]
 ) -> dict[str, tuple[int, ...]]:
     """Return the seeds of each kind: those given, all that were recorded, or the usual number."""
-    recorded = (
-        None if corridor.source.recordings is None else recorded_seeds(corridor.source.recordings)
-    )
+    recorded = None if corridor.recordings is None else recorded_seeds(corridor.recordings)
     found = {}
     for kind, allowed in KINDS.items():
         text = given[kind]

@@ -182,8 +182,8 @@ def save_records(
 
 def moved(road: Corridor, output: Path) -> Corridor:
     """Return a road whose recordings are in another folder."""
-    assert road.source.recordings is not None
-    there = dataclasses.replace(road.source.recordings, folder=str(output.absolute()))
+    assert road.recordings is not None
+    there = dataclasses.replace(road.recordings, folder=str(output.absolute()))
     return road.replaced(recordings=there)
 
 

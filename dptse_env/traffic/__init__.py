@@ -4,7 +4,7 @@ Importing this package does not import libsumo; only making a record does.
 """
 
 from dptse_env.geometry import Geometry
-from dptse_env.traffic.corridor import Conditions, Corridor, Recordings, Scales, Source
+from dptse_env.traffic.corridor import Conditions, Corridor, Recordings, Scales
 from dptse_env.traffic.demand import (
     Demand,
     DemandDistribution,
@@ -59,7 +59,6 @@ __all__ = [
     "RoadFile",
     "Scales",
     "Scenario",
-    "Source",
     "SumoScenario",
     "SumoVersionError",
     "VehicleClass",

@@ -1,7 +1,7 @@
-"""Corridors: a road, what drives on it, where its records come from, and its scales.
+"""Corridors: a road, what drives on it, its scales, and where its records come from.
 
-A `Corridor` has a part for each of these. Keywords of ``gym.make`` and road files name the fields
-of the parts without the part, as in ``corridor={"lanes": 2, "duration": 300}``.
+A `Corridor` has a part for each of the first three. Keywords of ``gym.make`` and road files name
+the fields of the parts without the part, as in ``corridor={"lanes": 2, "duration": 300}``.
 """
 
 import dataclasses
@@ -119,34 +119,6 @@ class Recordings:
 
 
 @dataclass(frozen=True)
-class Source:
-    """The origin of the records of a road: simulation by SUMO, unless a field says otherwise.
-
-    Attributes:
-        sumo: SUMO files of one's own, from which the road is recorded; None for a net that is made
-            of the corridor's geometry. With files, the vehicles are those of the files: the rates
-            of `demand` are what is published of them, the range of a `DemandDistribution` scales
-            them (SUMO's ``--scale``), `exit_shares` are published too, an incident limits the
-            vehicles on its segment, and `drivers` must be left at its default.
-        recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
-            With recordings the demand is a description of them, and there is no incident.
-
-    Raises:
-        ValueError: Both are given.
-    """
-
-    sumo: SumoScenario | None = None
-    recordings: Recordings | None = None
-
-    def __post_init__(self) -> None:
-        """Check the fields and bring them to their declared types."""
-        checked_fields(self, "corridor")
-        fits = self.sumo is None or self.recordings is None
-        allowed = "None on a road with SUMO files of its own"
-        require(fits, "corridor.recordings", allowed, self.recordings)
-
-
-@dataclass(frozen=True)
 class Scales:
     """Constants of a road that scale errors, observations and noise.
 
@@ -198,21 +170,29 @@ class Corridor:
         geometry: segments, ramps, lanes and speed limits.
         conditions: demand, incident and vehicles.
         scales: constants that scale errors, observations and noise.
-        source: the origin of the records.
+        sumo: SUMO files of one's own, from which the road is recorded; None for a net that is made
+            of the corridor's geometry. With files, the vehicles are those of the files: the rates
+            of `demand` are what is published of them, the range of a `DemandDistribution` scales
+            them (SUMO's ``--scale``), `exit_shares` are published too, an incident limits the
+            vehicles on its segment, and `drivers` must be left at its default.
+        recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
+            With recordings the demand is a description of them, and there is no incident.
         fixed_sensors: indices of the segments measured at every step.
         measured: names of fields of the parts, and of keywords of an environment, whose values were
             measured on the records of this road, as imports and ``dptse fit`` write down. They void
             a guarantee for the vehicles of these records.
 
     Raises:
-        ValueError: Demand, incident, sensors or source do not fit the road.
+        ValueError: Demand, incident, sensors or files do not fit the road, or both `sumo` and
+            `recordings` are given.
     """
 
     name: str
     geometry: Geometry
     conditions: Conditions
     scales: Scales
-    source: Source = field(default_factory=Source)
+    sumo: SumoScenario | None = None
+    recordings: Recordings | None = None
     fixed_sensors: tuple[Annotated[int, Interval(0, 2997)], ...] = ()
     measured: tuple[str, ...] = ()
 
@@ -226,7 +206,7 @@ class Corridor:
         unique = len(set(self.fixed_sensors)) == len(self.fixed_sensors)
         require(unique, "corridor.fixed_sensors", "free of duplicates", self.fixed_sensors)
         self._check_conditions()
-        self._check_source()
+        self._check_origin()
 
     def _check_conditions(self) -> None:
         """Check that demand and incidents fit the geometry."""
@@ -242,40 +222,43 @@ class Corridor:
             for segment in segments:
                 integer("corridor.incident.segment", segment, 0, road.n_mainline - 1)
 
-    def _check_source(self) -> None:
+    def _check_origin(self) -> None:
         """Check what traffic that is imported, or recorded from files of one's own, excludes."""
-        conditions, source = self.conditions, self.source
-        if source.recordings is not None:
+        conditions, sumo, recordings = self.conditions, self.sumo, self.recordings
+        one, allowed = (
+            sumo is None or recordings is None,
+            "None on a road with SUMO files of its own",
+        )
+        require(one, "corridor.recordings", allowed, recordings)
+        if recordings is not None:
             free, allowed = conditions.incident is None, "None where traffic is recorded"
             require(free, "corridor.incident", allowed, conditions.incident)
-            fixed, allowed = (
-                isinstance(conditions.demand, Demand),
-                "fixed where traffic is recorded",
-            )
+            fixed = isinstance(conditions.demand, Demand)
+            allowed = "fixed where traffic is recorded"
             require(fixed, "corridor.demand", allowed, conditions.demand)
-        if source.sumo is not None:
-            columns, n_columns = len(source.sumo.columns), self.record_shape[1]
+        if sumo is not None:
+            columns, n_columns = len(sumo.columns), self.record_shape[1]
             allowed = f"one for each of the {n_columns} record columns of this geometry"
             require(columns == n_columns, "corridor.sumo.columns", allowed, columns)
             plain, allowed = conditions.drivers == Drivers(), "left out on a road with SUMO files"
             require(plain, "corridor.drivers", f"{allowed} of its own", conditions.drivers)
-        fits = not conditions.vehicle_classes or source == Source()
+        fits = not conditions.vehicle_classes or (sumo is None and recordings is None)
         allowed = "left out where the traffic has classes of its own"
         require(fits, "corridor.vehicle_classes", allowed, conditions.vehicle_classes)
 
     @classmethod
     def hints(cls) -> dict[str, Any]:
         """Return the annotations of all fields by name, those of the parts instead of the parts."""
-        hints = dict(field_hints(cls))
-        for part in PARTS:
-            hints |= field_hints(hints.pop(part))
+        hints: dict[str, Any] = {}
+        for name, hint in field_hints(cls).items():
+            hints |= field_hints(hint) if name in PARTS else {name: hint}
         return hints
 
     def fields(self) -> dict[str, Any]:
         """Return all fields by name, plain JSON, those of the parts instead of the parts."""
-        content = dataclasses.asdict(self)
-        for part in PARTS:
-            content |= content.pop(part)
+        content: dict[str, Any] = {}
+        for name, value in dataclasses.asdict(self).items():
+            content |= value if name in PARTS else {name: value}
         return content
 
     @classmethod
@@ -306,7 +289,6 @@ class Corridor:
             "geometry": geometry,
             "conditions": part(Conditions, base and base.conditions),
             "scales": part(Scales, scales),
-            "source": part(Source, base and base.source),
         }
         own |= {name: fields[name] for name in field_hints(cls) if name in fields}
         return from_mapping(cls, own, "corridor", base)
@@ -342,11 +324,11 @@ class Corridor:
     def digest(self) -> str:
         """SHA-256 (hex) of what determines the traffic, stable across processes.
 
-        Corridors with the same geometry, conditions and source share their records. With a
+        Corridors with the same geometry, conditions and recordings share their records. With a
         `sumo`, its files, the demand's scale, the incident and the duration determine them.
         """
         content = dataclasses.asdict(self)
-        conditions, sumo = content["conditions"], self.source.sumo
+        conditions, sumo = content["conditions"], self.sumo
         if sumo is not None:
             return json_digest(
                 {
@@ -356,7 +338,7 @@ class Corridor:
                     "duration": conditions["duration"],
                 }
             )
-        recordings = self.source.recordings  # not the folder, which may be moved
+        recordings = self.recordings  # not the folder, which may be moved
         return json_digest(
             {
                 "geometry": content["geometry"],
@@ -366,5 +348,5 @@ class Corridor:
         )
 
 
-PARTS = ("geometry", "conditions", "scales", "source")
+PARTS = ("geometry", "conditions", "scales")
 """Fields of a `Corridor` whose fields keywords and road files name without the part."""

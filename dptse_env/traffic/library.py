@@ -125,8 +125,8 @@ class RecordLibrary:
             SumoVersionError: libsumo is missing or of another release series.
         """
         wanted = dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds)
-        if corridor.source.recordings is not None:
-            require_seeds(corridor.source.recordings, wanted)
+        if corridor.recordings is not None:
+            require_seeds(corridor.recordings, wanted)
         return [seed for seed in wanted if not self.record_path(corridor, seed).is_file()]
 
     def ensure(
@@ -151,13 +151,13 @@ class RecordLibrary:
         wanted = list(dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds))
         with self._explained_errors(corridor, wanted):
             missing = self.missing(corridor, wanted)
-            if missing and corridor.source.recordings is None:
+            if missing and corridor.recordings is None:
                 self._record(corridor, missing, n_workers, progress)
 
     def record_path(self, corridor: Corridor, seed: int) -> Path:
         """Return the file of a record, whether it exists or not."""
-        if corridor.source.recordings is not None:
-            return record_path(corridor.source.recordings.folder, seed)
+        if corridor.recordings is not None:
+            return record_path(corridor.recordings.folder, seed)
         folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}.safetensors"
 
@@ -183,8 +183,8 @@ class RecordLibrary:
         return folder
 
     def _load_or_record(self, corridor: Corridor, seed: int) -> Record:
-        if corridor.source.recordings is not None:
-            return load_record(corridor.source.recordings, seed, corridor.record_layout)
+        if corridor.recordings is not None:
+            return load_record(corridor.recordings, seed, corridor.record_layout)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)
         try:
             return Record.load(path, source, corridor.record_shape)

@@ -39,7 +39,7 @@ class Scenario:
         sumo_seed: seed of SUMO's random desired speeds.
         scale: factor on the corridor's demand [-].
 
-    On a road that is recorded from SUMO files of its own (`Source.sumo`), the vehicles are
+    On a road that is recorded from SUMO files of its own (`Corridor.sumo`), the vehicles are
     those of the files, and departures, origins, exits and classes are empty.
     """
 
@@ -82,7 +82,7 @@ def draw_scenario(corridor: Corridor, seed: int) -> Scenario:
         for each in corridor.conditions.incidents
     )
     generator = np.random.default_rng(arrival_seed)
-    duration = corridor.conditions.duration if corridor.source.sumo is None else 0
+    duration = corridor.conditions.duration if corridor.sumo is None else 0
     departures, origins = _arrivals(demand, duration, generator)
     return Scenario(
         seed=seed,

@@ -111,10 +111,10 @@ def simulate(corridor: Corridor, seed: int, remark: Remark = lambda text: None) 
     """
     scenario = draw_scenario(corridor, seed)
     with running(corridor, scenario, remark) as libsumo:
-        if corridor.source.sumo is None:
+        if corridor.sumo is None:
             return _observe(libsumo, corridor, scenario)
         clock = seconds(libsumo, corridor, scenario)
-        rows = own_sumo.observe(libsumo, corridor.source.sumo, scenario.incidents, clock)
+        rows = own_sumo.observe(libsumo, corridor.sumo, scenario.incidents, clock)
     table = np.array(rows, dtype=np.float64).reshape(len(rows), 4).T
     step, vehicle, segment, speed = table[:, np.lexsort((table[2], table[0]))]
     return Record(
@@ -136,10 +136,10 @@ def running(
     Yields:
         The module libsumo; `seconds` advances its simulation.
     """
-    if corridor.source.recordings is not None:
+    if corridor.recordings is not None:
         cause = "its traffic is recorded, not simulated"
         raise RecordingError.from_cause(corridor, scenario.seed, cause)
-    net = net_xml(corridor.geometry) if corridor.source.sumo is None else ""
+    net = net_xml(corridor.geometry) if corridor.sumo is None else ""
     with _one_at_a_time, tempfile.TemporaryDirectory(prefix="dptse-sumo-") as directory:
         libsumo = _import_libsumo()
         if libsumo.isLoaded():
@@ -155,7 +155,7 @@ def running(
                 try:
                     libsumo.start(command)
                     yield libsumo
-                    if corridor.source.sumo is not None:
+                    if corridor.sumo is not None:
                         own_sumo.tell_departures(libsumo, remark)
                 finally:
                     if libsumo.isLoaded():
@@ -175,7 +175,7 @@ def seconds(libsumo: ModuleType, corridor: Corridor, scenario: Scenario) -> Iter
     Yields:
         0, 1, ..., `corridor.duration`: the second [s] whose state libsumo holds.
     """
-    files, substeps, changes = corridor.source.sumo, SUBSTEPS, list[tuple[float, int, float]]()
+    files, substeps, changes = corridor.sumo, SUBSTEPS, list[tuple[float, int, float]]()
     if files is None:
         changes = limit_changes(scenario.incidents, corridor.geometry.speed_limits)
     else:
@@ -262,8 +262,8 @@ def _stderr_to(path: Path) -> Iterator[None]:
 
 def _command(folder: Path, net: str, corridor: Corridor, scenario: Scenario) -> list[str]:
     """Write SUMO's input files and return its command line."""
-    if corridor.source.sumo is not None:
-        return own_sumo.command(folder, corridor.source.sumo, scenario.sumo_seed, scenario.scale)
+    if corridor.sumo is not None:
+        return own_sumo.command(folder, corridor.sumo, scenario.sumo_seed, scenario.scale)
     net_file, route_file = folder / "corridor.net.xml", folder / "scenario.rou.xml"
     net_file.write_text(net, encoding="utf-8")
     route_file.write_text(routes_xml(corridor, scenario), encoding="utf-8")

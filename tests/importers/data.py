@@ -70,7 +70,7 @@ def run(path, source=PLAIN, road=STRAIGHT, splits=SPLITS, **options):
 
 def first_file(imported):
     """Return what the report says of the first file, as it was written."""
-    path = Path(imported.corridor.source.recordings.folder) / "report.json"
+    path = Path(imported.corridor.recordings.folder) / "report.json"
     content = json.loads(path.read_text(encoding="utf-8"))
     assert content == imported.report
     return content["files"][0]

@@ -58,7 +58,7 @@ def synthetic(variant):
 def recorded(original, tmp_path):
     """Copy the folder, so that a test may damage it; return the copy's corridor."""
     folder = tmp_path / "moved"
-    shutil.copytree(original.source.recordings.folder, folder)
+    shutil.copytree(original.recordings.folder, folder)
     return read_corridor(folder / "road.toml")
 
 
@@ -87,7 +87,7 @@ def test_a_seed_that_was_not_recorded_is_refused_with_those_that_are(recorded):
 
 
 def test_a_damaged_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
-    paths = [record_path(recorded.source.recordings.folder, seed) for seed in (0, 1)]
+    paths = [record_path(recorded.recordings.folder, seed) for seed in (0, 1)]
     content = paths[0].read_bytes()
     paths[0].write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     with pytest.raises(InvalidRecordError, match="another digest"):
@@ -101,7 +101,7 @@ def test_a_damaged_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
     paths[1].rename(paths[0])
     with pytest.raises(InvalidRecordError, match="source is"):
         RecordLibrary().get(recorded, 0)
-    shutil.copy(record_path(other.source.recordings.folder, 0), paths[0])
+    shutil.copy(record_path(other.recordings.folder, 0), paths[0])
     with pytest.raises(InvalidRecordError, match="not the record that was imported"):
         RecordLibrary().get(recorded, 0)
 
@@ -116,21 +116,21 @@ def test_a_damaged_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
     ],
 )
 def test_a_damaged_manifest_is_an_error(change, message, recorded):
-    manifest = Path(recorded.source.recordings.folder) / "manifest.json"
+    manifest = Path(recorded.recordings.folder) / "manifest.json"
     manifest.write_text(change(manifest.read_text()))
     with pytest.raises(InvalidRecordError, match=message):
-        recorded_seeds(recorded.source.recordings)
-    folder = recorded.source.recordings.folder
+        recorded_seeds(recorded.recordings)
+    folder = recorded.recordings.folder
     digest = write_manifest(Path(folder), FREE.record_layout, {"x" * 1000: ""}, [])
     with pytest.raises(InvalidRecordError, match=r"manifest\.json: records must have .{1,150}$"):
         recorded_seeds(Recordings(folder, digest))
     manifest.unlink()
     with pytest.raises(InvalidRecordError, match="recordings cannot be read"):
-        recorded_seeds(recorded.source.recordings)
+        recorded_seeds(recorded.recordings)
 
 
 def test_the_digest_covers_the_content_and_not_the_folder(original, recorded, tmp_path):
-    assert recorded.source.recordings.folder != original.source.recordings.folder
+    assert recorded.recordings.folder != original.recordings.folder
     assert recorded.digest == original.digest
     assert recorded.digest != FREE.digest
     other = write(tmp_path / "other", (0, 1, 2, 9))
@@ -148,7 +148,7 @@ def test_recorded_traffic_has_a_fixed_demand_and_no_incident(recorded):
 
 
 def test_environments_replay_recordings(recorded):
-    road = {"corridor": f"{recorded.source.recordings.folder}/road.toml"}
+    road = {"corridor": f"{recorded.recordings.folder}/road.toml"}
     assert resolve("short-highway", road).traffic_seeds == (0, 1)  # those of training
     with pytest.raises(ValueError, match=r"must be one that was recorded .*, got 2\.\.63"):
         resolve("short-highway", {**road, "traffic_seeds": "0:64"})

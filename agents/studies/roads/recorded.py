@@ -73,8 +73,8 @@ def section(number: int) -> Corridor:
         with tempfile.TemporaryDirectory() as work:
             cut = Section(number, SEGMENTS, windows=1, seconds=SECONDS)
             road = read_corridor(cut.write(Path(work), RecordLibrary()))
-            assert road.source.recordings is not None
-            record = load_record(road.source.recordings, 0, road.record_layout)
+            assert road.recordings is not None
+            record = load_record(road.recordings, 0, road.record_layout)
         kept = save_records(folder, road, [record], [{"seed": number}])
         write_corridor(folder / ROAD, road.replaced(recordings=kept))
 

@@ -13,7 +13,7 @@ import numpy as np
 from dptse_env.importers.measured import with_measured
 from dptse_env.importers.sumo_net.configuration import Files
 from dptse_env.importers.sumo_net.segmentation import Segmentation
-from dptse_env.traffic.corridor import Conditions, Corridor, Scales, Source
+from dptse_env.traffic.corridor import Conditions, Corridor, Scales
 from dptse_env.traffic.demand import Demand, Profile
 from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.traffic.record import Record
@@ -158,7 +158,7 @@ def _draft(
         geometry=road,
         conditions=Conditions(Demand(((0.0, 0.0),), (0.0,) * n_on), duration),
         scales=Scales.of(road),
-        source=Source(sumo=sumo),
+        sumo=sumo,
         fixed_sensors=(N - 1, *(N + n_on + i for i in range(n_off))),
     )
 

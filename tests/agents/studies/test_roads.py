@@ -147,7 +147,7 @@ def test_a_queue_through_the_end_is_told_from_one_inside():
 def test_sections_are_as_they_are_called():
     for queue, numbers in recorded.QUEUES.items():
         road = CORRIDORS.find(f"agents.studies.roads.recorded:section_{numbers[1]}")()
-        record = load_record(road.source.recordings, numbers[1], road.record_layout)
+        record = load_record(road.recordings, numbers[1], road.record_layout)
         assert recorded.queue_of(road, record) == queue
 
 
@@ -170,4 +170,4 @@ def test_a_recorded_road_is_made_once_in_one_piece(tmp_path, monkeypatch):
     assert CORRIDORS.find("agents.studies.roads.recorded:idm")() == road
     keywords = {"corridor": road, "traffic_seeds": [2000]}
     with quietly():
-        assert make_config(roads.PRIVATE, keywords).corridor.source == road.source
+        assert make_config(roads.PRIVATE, keywords).corridor.recordings == road.recordings

@@ -70,7 +70,7 @@ def test_routes_of_no_use_are_refused(files, tmp_path, content, message):
 def test_every_vehicle_on_the_path_and_its_ramps_is_counted_once(road):
     corridor = road.corridor
     limits = {}
-    for column in corridor.source.sumo.columns:
+    for column in corridor.sumo.columns:
         for edge, start, end in column:
             low, high = limits.get(edge, (np.inf, 0.0))
             limits[edge] = min(low, start), max(high, end)
@@ -247,7 +247,7 @@ def test_an_incident_slows_the_vehicles_on_its_segment_alone(road):
 
 def test_a_warm_up_starts_the_record_with_traffic(files, road):
     warm = imported(files, warm_up=120)
-    assert warm.corridor.source.sumo.begin == 120
+    assert warm.corridor.sumo.begin == 120
     assert road.record.counts[0].sum() == 0
     np.testing.assert_array_equal(warm.record.counts[0], road.record.counts[120])
 
@@ -256,7 +256,7 @@ def test_an_incident_makes_no_vehicle_faster(files, road, tmp_path):
     slow = tmp_path / "slow.rou.xml"
     slow.write_text(FLOWS.replace('id="car"', 'id="car" maxSpeed="10"'))
     digests = file_digest(files.net), file_digest(slow)
-    sumo = dataclasses.replace(road.corridor.source.sumo, routes=(str(slow),), sha256=digests)
+    sumo = dataclasses.replace(road.corridor.sumo, routes=(str(slow),), sha256=digests)
     limited = road.corridor.replaced(sumo=sumo, incident=Incident(2, ((30, 200, 90.0),)))
     assert 30.0 < simulate(limited, 0).speed.max() <= 36.01
 
@@ -266,7 +266,7 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
     folder.mkdir()
     for path in (files.net, *files.routes):
         shutil.copy(path, folder)
-    sumo = dataclasses.replace(road.corridor.source.sumo, folder=str(folder))
+    sumo = dataclasses.replace(road.corridor.sumo, folder=str(folder))
     corridor = road.corridor.replaced(sumo=sumo)
     write_corridor(folder / "road.toml", corridor)
     assert str(tmp_path) not in (folder / "road.toml").read_text()
@@ -280,7 +280,7 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
     write_corridor(tmp_path / "link.toml", corridor, {"bandwidth": 3})
     assert (read_corridor(below), "bandwidth" in below.read_text()) == (corridor, True)
     moved = read_corridor(folder.rename(there) / "road.toml")
-    assert Path(moved.source.sumo.folder) == there
+    assert Path(moved.sumo.folder) == there
     assert moved.digest == road.corridor.digest
     np.testing.assert_array_equal(simulate(moved, 0).counts, road.record.counts)
     published = moved.replaced(demand=moved.conditions.demand.scaled(2.0), lanes=4)
@@ -296,7 +296,7 @@ def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, 
 
 
 def test_scenarios_and_corridors_of_no_use_are_refused(road):
-    sumo = road.corridor.source.sumo
+    sumo = road.corridor.sumo
     for change, message in (
         ({"options": ("--fcd-output=all.xml",)}, "options must be options that change the traffic"),
         ({"options": ("-v",)}, "options must be --name=value each"),
