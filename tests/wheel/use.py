@@ -26,20 +26,9 @@ def main() -> None:
             assert np.isfinite(reward)
         assert env.render().std() > 0
         env.close()
-    for estimator, backend in (
-        ("random_walk", "compiled"),
-        ("ekf", "reference"),
-        ("ukf", "compiled"),
-        ("ukf", "reference"),
-        ("enkf", "compiled"),
-        ("mhe", "compiled"),
-        ("mhe", "reference"),
-    ):
+    for estimator in ("random_walk", "ukf", "enkf", "mhe"):
         env = gym.make(
-            "dptse_env:dptse/ShortHighway-v0",
-            estimator=estimator,
-            backend=backend,
-            parameters="w99-3lane",
+            "dptse_env:dptse/ShortHighway-v0", estimator=estimator, parameters="w99-3lane"
         )
         env.reset(seed=0)
         env.step(env.action_space.sample())
