@@ -166,6 +166,9 @@ def keyword(name, rng, given):
     if name in NAMES and (rng.random() < 0.5 or name in ONLY_NAMES):
         return one_of(NAMES[name], rng)
     match name:
+        case "corridor":  # any fields, since the others are those of the road that is changed
+            fields = rng.choice([*Corridor.hints()], int(rng.integers(4)), replace=False)
+            return {str(field): some(hints[str(field)], rng) for field in fields}
         case "epsilon" | "delta":
             return float(10.0 ** rng.uniform(-5, 3 if name == "epsilon" else 0))
         case "parameters":

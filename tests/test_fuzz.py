@@ -1,10 +1,12 @@
 """The fuzzer sees what escapes, and draws the same cases from the same seed."""
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from dptse_env.config import resolve
 from tests import fuzz
 
 
@@ -47,6 +49,16 @@ def test_a_case_is_drawn_again_from_its_seed_and_number(tmp_path):
             rng = np.random.default_rng([seed, 5])
             drawn.append(repr(fuzz.KINDS[kind](rng, tmp_path)[0]))
         assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_some_corridors_that_are_drawn_are_in_order():
+    rng, n_made = np.random.default_rng(0), 0
+    for _ in range(30):
+        drawn = fuzz.keyword("corridor", rng, {})
+        if isinstance(drawn, dict) and drawn:
+            with contextlib.suppress(ValueError):
+                n_made += resolve("paper-highway", {"corridor": drawn}).corridor.name != ""
+    assert n_made > 0
 
 
 @pytest.mark.slow
