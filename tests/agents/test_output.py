@@ -115,12 +115,12 @@ def test_bars_begin_at_zero_and_those_of_learned_policies_stand_out():
         for name, mean in (("mine", 8.0), ("shift-ahead", 10.0))
     }
     (axis,) = draw_bars(errors, ["mine"]).axes
-    mine, paper = axis.patches
-    assert (mine.get_width(), paper.get_width()) == (8.0, 10.0)
-    assert mine.get_facecolor() != paper.get_facecolor()
+    mine, other = axis.patches
+    assert (mine.get_width(), other.get_width()) == (8.0, 10.0)
+    assert mine.get_facecolor() != other.get_facecolor()
     assert axis.get_xlim()[0] == 0.0
     assert axis.get_xlim()[1] > 11.0
-    assert mine.get_y() > paper.get_y()
+    assert mine.get_y() > other.get_y()
 
 
 def test_a_wide_figure_is_made_as_narrow_as_a_page():
