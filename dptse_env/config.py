@@ -449,9 +449,7 @@ def _recorded_seeds(base: tuple[int, ...], corridor: Corridor) -> tuple[int, ...
     """Return the preset's traffic seeds, or all of training that were recorded on the road."""
     if corridor.recordings is None:
         return base
-    return tuple(
-        seed for seed in recorded_seeds(corridor.recordings) if seed in TRAINING_SEEDS
-    )
+    return tuple(seed for seed in recorded_seeds(corridor.recordings) if seed in TRAINING_SEEDS)
 
 
 def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:
