@@ -269,8 +269,6 @@ class Record:
             wanted = {"field": np.dtype("<f8")} if "field" in arrays else dict(cls.COLUMNS)
             types = {name: array.dtype for name, array in arrays.items()}
             require(types == wanted, "arrays", str(wanted), types)
-            for array in arrays.values():
-                array.flags.writeable = False  # nobody else has them: they need not be copied
             fields: dict[str, Any] = dict(arrays)
             return cls(n_steps=shape[0], n_columns=shape[1], **fields)
         except ValueError as error:

@@ -53,11 +53,6 @@ class Scenario:
     sumo_seed: int
     scale: float = 1.0
 
-    @property
-    def n_vehicles(self) -> int:
-        """Number of vehicles that want to depart."""
-        return len(self.departures)
-
 
 def draw_scenario(corridor: Corridor, seed: int) -> Scenario:
     """Draw the scenario of a traffic seed; the same seed gives the same scenario.

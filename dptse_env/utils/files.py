@@ -225,8 +225,6 @@ def _parsed(content: bytes) -> tuple[dict[str, Any], dict[str, AnyArray]]:
     Raises:
         ValueError, LookupError, RecursionError, SafetensorError: It is damaged.
     """
-    if content[:2] == b"PK":
-        raise ValueError("it is a zip archive, as earlier versions wrote; make the file again")
     size = int.from_bytes(content[:8], "little")
     if size > LARGEST_HEADER:
         raise ValueError(f"its header must have at most {LARGEST_HEADER} bytes, got {size}")
