@@ -91,8 +91,8 @@ class Geometry:
             self._require(list(faces) == sorted(set(faces)), name, "increasing")
         disjoint = not set(self.on_ramps) & set(self.off_ramps)
         self._require(disjoint, "off_ramps", f"at other faces than the on-ramps {self.on_ramps}")
-        fits = len(self.exit_shares) == self.n_off_ramps
-        allowed = f"one share for each of the {self.n_off_ramps} off-ramps"
+        fits = len(self.exit_shares) == len(self.off_ramps)
+        allowed = f"one share for each of the {len(self.off_ramps)} off-ramps"
         self._require(fits, "exit_shares", allowed)
 
     def _check_profiles(self) -> None:
@@ -118,19 +118,9 @@ class Geometry:
             require(most <= lanes[beside], "corridor.ramp_lanes", allowed, most)
 
     @property
-    def n_on_ramps(self) -> int:
-        """Number I of on-ramps."""
-        return len(self.on_ramps)
-
-    @property
-    def n_off_ramps(self) -> int:
-        """Number O of off-ramps."""
-        return len(self.off_ramps)
-
-    @property
     def n_ramps(self) -> int:
         """Number I + O of ramps."""
-        return self.n_on_ramps + self.n_off_ramps
+        return len(self.on_ramps) + len(self.off_ramps)
 
     @cached_property
     def n_segments(self) -> int:
@@ -138,19 +128,19 @@ class Geometry:
         return self.n_mainline + sum(self._per_ramp(self.ramp_segments))
 
     @cached_property
-    def n_boundaries(self) -> int:
-        """Number R = 2 + I + O of boundary segments around them."""
-        return 2 + self.n_ramps
+    def n_cells(self) -> int:
+        """Number S + R of cells, with the R = 2 + I + O boundary segments around them."""
+        return self.n_segments + 2 + self.n_ramps
 
     @cached_property
     def on_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
         """Segments of each on-ramp, in the direction of travel."""
-        return self._ramp_segments[: self.n_on_ramps]
+        return self._ramp_segments[: len(self.on_ramps)]
 
     @cached_property
     def off_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
         """Segments of each off-ramp, in the direction of travel."""
-        return self._ramp_segments[self.n_on_ramps :]
+        return self._ramp_segments[len(self.on_ramps) :]
 
     @cached_property
     def _ramp_segments(self) -> tuple[tuple[int, ...], ...]:
@@ -174,13 +164,6 @@ class Geometry:
     def speed_limits(self) -> tuple[float, ...]:
         """Speed limit [km/h] of each of the S segments, outside incidents."""
         return self._along(self.speed_limit, self.ramp_speed_limit)
-
-    @cached_property
-    def boundary_neighbours(self) -> tuple[int, ...]:
-        """Segment next to each of the R boundary segments."""
-        before = [segments[0] for segments in self.on_ramp_segments]
-        after = [segments[-1] for segments in self.off_ramp_segments]
-        return (0, self.n_mainline - 1, *before, *after)
 
     @property
     def most_lanes(self) -> int:

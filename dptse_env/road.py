@@ -72,7 +72,8 @@ def make_road(geometry: Geometry) -> Road:
     """Return the arrays of a geometry."""
     n, on, off = geometry.n_mainline, geometry.on_ramp_segments, geometry.off_ramp_segments
     S, n_on, n_off = geometry.n_segments, len(on), len(off)
-    beside = np.array(geometry.boundary_neighbours, dtype=np.int64)
+    around = (0, n - 1, *(segments[0] for segments in on), *(segments[-1] for segments in off))
+    beside = np.array(around, dtype=np.int64)
     lengths, lanes, limits = (
         np.append(values, np.array(values)[beside]).astype(np.float64)
         for values in (geometry.segment_lengths, geometry.segment_lanes, geometry.speed_limits)

@@ -302,7 +302,7 @@ def describe(road: ImportedRoad) -> str:
     corridor, names = road.corridor, road.segments.names
     geometry, files = corridor.geometry, corridor.sumo
     assert files is not None
-    n, n_on = geometry.n_mainline, geometry.n_on_ramps
+    n, n_on = geometry.n_mainline, len(geometry.on_ramps)
     lengths, lanes, limits = (
         each[:n]
         for each in (geometry.segment_lengths, geometry.segment_lanes, geometry.speed_limits)

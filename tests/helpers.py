@@ -206,7 +206,7 @@ def lock_step(
 
 # --- roads and records ----------------------------------------------------------------------------
 
-SHORT_COLUMNS = SHORT_HIGHWAY.geometry.n_segments + SHORT_HIGHWAY.geometry.n_boundaries
+SHORT_COLUMNS = SHORT_HIGHWAY.geometry.n_cells
 AWAY = -1
 """Place of a vehicle that is not on the road."""
 
@@ -289,10 +289,6 @@ class Stretch:
         return tuple((first + o,) for o in range(len(self.off_ramps)))
 
     @property
-    def boundary_neighbours(self) -> tuple[int, ...]:
-        return (0, self.n_mainline - 1, *range(self.n_mainline, self.n_segments))
-
-    @property
     def segment_lanes(self) -> tuple[int, ...]:
         return (self.lanes,) * self.n_mainline + (self.ramp_lanes,) * self.n_ramps
 
@@ -344,7 +340,7 @@ class SumRelease(ReleaseModel):
     def true_values(self, request):
         """Return what is released before noise is added, shape (k, n_columns, 2)."""
         task, corridor = self.task, self.task.corridor
-        every = corridor.geometry.n_segments + corridor.geometry.n_boundaries
+        every = corridor.geometry.n_cells
         values = self.traffic.aggregates(request.traffic, request.times, every)
         values[..., 1] = values[..., 0] * (values[..., 1] - 0.5 * corridor.geometry.speed_limit)
         weights = task.covers / task.channels.span[:, None]

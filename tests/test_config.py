@@ -194,7 +194,7 @@ def test_neither_bandwidth_nor_sensors_enter_an_honest_bound_but_the_papers():
     private = {"privacy": {"boundary_inputs": "private"}}
     fewer, more = (make_release(resolve("paper-highway", k)).sensitivity[0] for k in ({}, private))
     assert dict(fewer.assumptions)["n_sensors"] == 8
-    assert dict(more.assumptions)["n_sensors"] == 8 + PAPER_HIGHWAY.geometry.n_boundaries
+    assert dict(more.assumptions)["n_sensors"] == 8 + 2 + PAPER_HIGHWAY.geometry.n_ramps
 
 
 def test_a_void_guarantee_is_warned_of_with_its_reason():

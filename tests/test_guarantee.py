@@ -109,7 +109,7 @@ COMMON = 4
 """Traffic seed of a record that both worlds have. Theirs are 0 and 1; in 2 and 3 the vehicle that
 differs is alone."""
 ROAD = SHORT_HIGHWAY.replaced(duration=DURATION, incident=None)
-PLACES = ROAD.geometry.n_segments + ROAD.geometry.n_boundaries
+PLACES = ROAD.geometry.n_cells
 ESTIMATORS = ("ekf", "random_walk", "recurrent", "ukf", "enkf", "mhe")
 
 

@@ -99,7 +99,7 @@ class Planner:
         # Record columns that are observed without a query.
         boundaries = range(
             corridor.geometry.n_segments,
-            corridor.geometry.n_segments + corridor.geometry.n_boundaries,
+            corridor.geometry.n_cells,
         )
         is_private = config.privacy.boundary == "private"
         self._always = [*corridor.fixed_sensors, *(boundaries if is_private else ())]

@@ -226,7 +226,7 @@ def _section(highway: Corridor, first: int, section: Section) -> tuple[Corridor,
         first - 1,
         first + n,
         *(before + k for k in on),
-        *(before + highway.geometry.n_on_ramps + k for k in off),
+        *(before + len(highway.geometry.on_ramps) + k for k in off),
     ]
     geometry = dataclasses.replace(
         highway.geometry,

@@ -116,7 +116,7 @@ def import_trajectories(
             for seed, (recording, window) in zip(flat, windows, strict=True)
         ]  # fmt: skip
 
-        used, empty = np.zeros(bare.record_shape[1], dtype=bool), list[int]()
+        used, empty = np.zeros(bare.geometry.n_cells, dtype=bool), list[int]()
 
         def records() -> Iterator[Record]:
             for source_of, (recording, window) in zip(sources, windows, strict=True):
@@ -143,7 +143,7 @@ def import_trajectories(
         notes += _overlaps(sources, corridor.conditions.duration)
 
         def load(seed: int) -> Record:
-            return load_record(kept, seed, bare.record_layout)
+            return load_record(bare, kept, seed)
 
         # One at a time, so that one is in memory.
         measured = measure(bare, lambda: map(load, seeds[splits[0].name]))
@@ -173,11 +173,9 @@ def save_records(
     """
     digests = {}
     for source, record in zip(sources, records, strict=True):
-        save_record(folder, source["seed"], road.record_layout, record)
+        save_record(folder, source["seed"], road, record)
         digests[source["seed"]] = record.digest
-    return Recordings(
-        str(folder), write_manifest(folder, road.record_layout, digests, sources, kind)
-    )
+    return Recordings(str(folder), write_manifest(folder, road, digests, sources, kind))
 
 
 def moved(road: Corridor, output: Path) -> Corridor:

@@ -39,7 +39,7 @@ class Branches:
         self._add([start, *self.faces, end], [first, *range(n), first + 1])
         for number, (face, _, segments) in enumerate(road.ramps()):
             boundary = first + 2 + number
-            if number < road.n_on_ramps:
+            if number < len(road.on_ramps):
                 ramp = [boundary, *segments]
                 before = self.faces[face] - np.cumsum(lengths[ramp][::-1])[::-1]
                 starts = [*before, *self.faces[face:], end]
@@ -57,7 +57,7 @@ class Branches:
     @property
     def column_starts(self) -> tuple[NDArray[np.int16], FloatArray]:
         """Branch of each record column, and the position at which it starts [km]."""
-        n_columns = self.corridor.record_shape[1]
+        n_columns = self.corridor.geometry.n_cells
         branch, start = np.zeros(n_columns, dtype=np.int16), np.zeros(n_columns)
         for number, of_branch in reversed([*enumerate(self.columns)]):
             columns = of_branch[:-1]
@@ -95,11 +95,8 @@ def placed(
         ValueError: The layout does not fit the road.
     """
     corridor = branches.corridor
-    for name, n in (
-        ("on_ramps", corridor.geometry.n_on_ramps),
-        ("off_ramps", corridor.geometry.n_off_ramps),
-    ):
-        strips = getattr(layout, name)
+    for name in ("on_ramps", "off_ramps"):
+        strips, n = getattr(layout, name), len(getattr(corridor.geometry, name))
         allowed = f"one strip for each of the {n} {name.replace('_', '-')} at most"
         require(len(strips) <= n, f"layout.{name}", allowed, len(strips))
     for strip in (*layout.on_ramps, *layout.off_ramps, layout.mainline):
@@ -121,7 +118,7 @@ def placed(
         return points.with_columns(column=column, lane_number=number)
     position = pl.col("x") - layout.origin * unit
     points = points.with_columns(
-        branch=_branch(layout, corridor.geometry.n_on_ramps, unit),
+        branch=_branch(layout, len(corridor.geometry.on_ramps), unit),
         position=-position if layout.reversed else position,
     )
     return points.with_columns(column=column_at(branches), lane_number=number)

@@ -140,7 +140,7 @@ class Recording:
             segment=found["column"].to_numpy(),
             speed=found["speed"].to_numpy(),
             n_steps=corridor.conditions.duration + 1,
-            n_columns=corridor.geometry.n_segments + corridor.geometry.n_boundaries,
+            n_columns=corridor.geometry.n_cells,
         )
 
     def points(self) -> pl.DataFrame:

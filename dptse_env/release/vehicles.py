@@ -80,7 +80,7 @@ class Traffic:
         """Prepare tables; nothing is loaded or recorded yet."""
         self.corridor, self.seeds, self.library = corridor, seeds, library
         self.populations = tuple(populations)
-        columns = corridor.geometry.n_segments + corridor.geometry.n_boundaries
+        columns = corridor.geometry.n_cells
         # np.empty takes address space, not memory, until a record is written.
         self._table = np.empty((len(seeds), corridor.conditions.duration + 1, columns, 2))
         self._loaded = np.zeros(len(seeds), dtype=bool)

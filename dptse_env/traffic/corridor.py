@@ -211,11 +211,11 @@ class Corridor:
     def _check_conditions(self) -> None:
         """Check that demand and incidents fit the geometry."""
         road, demand = self.geometry, self.conditions.published_demand
-        allowed = f"one rate for each of the {road.n_on_ramps} on-ramps"
-        fits = len(demand.on_ramps) == road.n_on_ramps
+        allowed = f"one rate for each of the {len(road.on_ramps)} on-ramps"
+        fits = len(demand.on_ramps) == len(road.on_ramps)
         require(fits, "corridor.demand.on_ramps", allowed, demand.on_ramps)
-        allowed = f"steps for each of the {road.n_off_ramps} off-ramps"
-        fits = demand.exit_shares is None or len(demand.exit_shares) == road.n_off_ramps
+        allowed = f"steps for each of the {len(road.off_ramps)} off-ramps"
+        fits = demand.exit_shares is None or len(demand.exit_shares) == len(road.off_ramps)
         require(fits, "corridor.demand.exit_shares", allowed, demand.exit_shares)
         for each in self.conditions.incidents:
             segments = [each.segment] if isinstance(each, Incident) else each.segments
@@ -237,7 +237,7 @@ class Corridor:
             allowed = "fixed where traffic is recorded"
             require(fixed, "corridor.demand", allowed, conditions.demand)
         if sumo is not None:
-            columns, n_columns = len(sumo.columns), self.record_shape[1]
+            columns, n_columns = len(sumo.columns), self.geometry.n_cells
             allowed = f"one for each of the {n_columns} record columns of this geometry"
             require(columns == n_columns, "corridor.sumo.columns", allowed, columns)
             plain, allowed = conditions.drivers == Drivers(), "left out on a road with SUMO files"
@@ -305,20 +305,7 @@ class Corridor:
     @property
     def record_shape(self) -> tuple[int, int]:
         """Number of steps of a record, the second 0 among them, and of its columns, S + R."""
-        return self.conditions.duration + 1, self.geometry.n_segments + self.geometry.n_boundaries
-
-    @property
-    def record_layout(self) -> dict[str, Any]:
-        """The fields that the columns and the length of a record depend on, as plain JSON."""
-        road = self.geometry
-        return {
-            "n_mainline": road.n_mainline,
-            "on_ramps": list(road.on_ramps),
-            "off_ramps": list(road.off_ramps),
-            "ramp_segments": [len(segments) for _, _, segments in road.ramps()],
-            "segment_lengths": list(road.segment_lengths),
-            "duration": self.conditions.duration,
-        }
+        return self.conditions.duration + 1, self.geometry.n_cells
 
     @cached_property
     def digest(self) -> str:

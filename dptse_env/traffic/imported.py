@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from dptse_env.traffic.corridor import Recordings
+from dptse_env.traffic.corridor import Corridor, Recordings
 from dptse_env.traffic.record import InvalidRecordError, Record
 from dptse_env.utils.files import json_digest
 from dptse_env.utils.validation import check_object, integer, parse_json
@@ -33,24 +33,24 @@ def record_path(folder: str | Path, seed: int) -> Path:
     return Path(folder) / "records" / f"{seed:08d}.safetensors"
 
 
-def save_record(folder: Path, seed: int, road: Mapping[str, Any], record: Record) -> None:
+def save_record(folder: Path, seed: int, corridor: Corridor, record: Record) -> None:
     """Write the record of a traffic seed to a folder whose manifest is written last.
 
     Args:
         folder: The folder of the recordings.
         seed: The traffic seed.
-        road: `Corridor.record_layout` of the road that the record is made for.
+        corridor: The road that the record is made for.
         record: The record.
 
     Raises:
         OSError: It cannot be written.
     """
-    record.save(record_path(folder, seed), _source(seed, road))
+    record.save(record_path(folder, seed), _source(seed, corridor))
 
 
 def write_manifest(
     folder: Path,
-    road: Mapping[str, Any],
+    corridor: Corridor,
     digests: Mapping[int, str],
     sources: list[dict[str, Any]],
     kind: Kind = "vehicles",
@@ -59,7 +59,7 @@ def write_manifest(
 
     Args:
         folder: The folder of the recordings.
-        road: `Corridor.record_layout` of the road that they are made for.
+        corridor: The road that they are made for.
         digests: `Record.digest` of each record by traffic seed.
         sources: JSON descriptions of the windows that they were cut from, for the reader.
         kind: Whether the records have vehicles or are measured fields.
@@ -68,7 +68,7 @@ def write_manifest(
         "format": FORMAT,
         "version": VERSION,
         "kind": kind,
-        "road": dict(road),
+        "road": _layout(corridor),
         "records": {str(seed): digest for seed, digest in digests.items()},
         "sources": sources,
     }
@@ -101,13 +101,13 @@ def require_seeds(recordings: Recordings, seeds: Iterable[int], path: str = "tra
         )
 
 
-def load_record(recordings: Recordings, seed: int, road: Mapping[str, Any]) -> Record:
+def load_record(corridor: Corridor, recordings: Recordings, seed: int) -> Record:
     """Read the record of a traffic seed.
 
     Args:
+        corridor: The road that the record must be made for.
         recordings: The folder.
         seed: The traffic seed.
-        road: What the record must be made for: `Corridor.record_layout`.
 
     Raises:
         ValueError: There is no record of the seed.
@@ -115,6 +115,7 @@ def load_record(recordings: Recordings, seed: int, road: Mapping[str, Any]) -> R
     """
     require_seeds(recordings, [integer("traffic seed", seed, 0)])
     manifest, path = _manifest(recordings), record_path(recordings.folder, seed)
+    road = _layout(corridor)
     if manifest["road"] != road:
         differing = [key for key in road if manifest["road"].get(key) != road[key]]
         raise InvalidRecordError(
@@ -122,7 +123,7 @@ def load_record(recordings: Recordings, seed: int, road: Mapping[str, Any]) -> R
             f"the corridor's: import the trajectories again for this corridor"
         )
     try:
-        record = Record.load(path, _source(seed, road), _shape(road))
+        record = Record.load(path, _source(seed, corridor), corridor.record_shape)
     except FileNotFoundError as problem:
         raise InvalidRecordError(f"{path}: the record is missing") from problem
     if record.digest != manifest["records"][str(seed)]:
@@ -174,11 +175,18 @@ def _digest(manifest: Mapping[str, Any]) -> str:
     return json_digest(content)
 
 
-def _shape(road: Mapping[str, Any]) -> tuple[int, int]:
-    """Return `Corridor.record_shape`, given the layout."""
-    n_ramps = len(road["ramp_segments"])
-    return road["duration"] + 1, road["n_mainline"] + sum(road["ramp_segments"]) + 2 + n_ramps
+def _layout(corridor: Corridor) -> dict[str, Any]:
+    """Return the fields that the columns and the length of a record depend on, as plain JSON."""
+    road = corridor.geometry
+    return {
+        "n_mainline": road.n_mainline,
+        "on_ramps": list(road.on_ramps),
+        "off_ramps": list(road.off_ramps),
+        "ramp_segments": [len(segments) for _, _, segments in road.ramps()],
+        "segment_lengths": list(road.segment_lengths),
+        "duration": corridor.conditions.duration,
+    }
 
 
-def _source(seed: int, road: Mapping[str, Any]) -> dict[str, object]:
-    return {"recorded": True, "seed": seed, "road": dict(road)}
+def _source(seed: int, corridor: Corridor) -> dict[str, object]:
+    return {"recorded": True, "seed": seed, "road": _layout(corridor)}

@@ -119,7 +119,7 @@ def simulate(corridor: Corridor, seed: int, remark: Remark = lambda text: None) 
     step, vehicle, segment, speed = table[:, np.lexsort((table[2], table[0]))]
     return Record(
         step=step, vehicle=vehicle, segment=segment, speed=speed,
-        n_steps=corridor.record_shape[0], n_columns=corridor.record_shape[1],
+        n_steps=corridor.conditions.duration + 1, n_columns=corridor.geometry.n_cells,
     )  # fmt: skip
 
 

@@ -236,8 +236,8 @@ def routes_xml(corridor: Corridor, scenario: Scenario) -> str:
     for name, attributes in classes.items():
         values = " ".join(f'{key}="{value}"' for key, value in attributes.items())
         lines.append(f'<vType id="{name}" {values}/>')
-    for origin in range(MAINLINE, road.n_on_ramps):
-        for end in range(MAINLINE, road.n_off_ramps):
+    for origin in range(MAINLINE, len(road.on_ramps)):
+        for end in range(MAINLINE, len(road.off_ramps)):
             first = 0 if origin == MAINLINE else road.on_ramps[origin]
             last = road.n_mainline if end == MAINLINE else road.off_ramps[end]
             if first >= last:

@@ -119,8 +119,8 @@ def night():
     return next(
         number
         for number in range(1000)
-        if draw_highway(number).geometry.n_on_ramps
-        and draw_highway(number).geometry.n_off_ramps
+        if draw_highway(number).geometry.on_ramps
+        and draw_highway(number).geometry.off_ramps
         and draw_highway(number).conditions.published_demand.mainline[0][1] < 1000.0
     )
 

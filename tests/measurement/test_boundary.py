@@ -25,7 +25,7 @@ from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, 
 from tests.release.worlds import ONE
 
 CENTRE = 0.5 * SHORT_HIGHWAY.geometry.speed_limit
-R = SHORT_HIGHWAY.geometry.n_boundaries
+R = SHORT_HIGHWAY.geometry.n_cells - SHORT_HIGHWAY.geometry.n_segments
 
 
 def make(kind, preset="capped", n_episodes=1):

@@ -136,7 +136,7 @@ def test_the_cap_belongs_to_trips_and_without_it_values_are_the_aggregates():
 @pytest.mark.parametrize("preset", ["printed", "corrected", "capped"])
 def test_a_vehicle_counts_alike_on_every_segment_in_units_of_the_noise(preset):
     road = UNEVEN.replaced(duration=T)
-    n_columns = road.geometry.n_segments + road.geometry.n_boundaries
+    n_columns = road.geometry.n_cells
     asked = RELEASE_MODELS[preset].settings_type(preset=preset, epsilon=5.0)
     release = Worlds(crowd(200, last=n_columns, n_columns=n_columns), road=road).started(asked)
     every = request(1, n_columns=n_columns)
@@ -226,7 +226,7 @@ def test_the_extremes_of_the_proof_are_met_and_no_more(share, cap):
 
 def test_on_segments_of_unequal_length_the_whole_of_mu_is_reached():
     road = UNEVEN.replaced(duration=T)
-    n_columns = road.geometry.n_segments + road.geometry.n_boundaries
+    n_columns = road.geometry.n_cells
     standing = (np.full((1, T + 1), segment) for segment in (4, 5))  # the longest, the shortest
     worlds = Worlds(*(record(at, 0.0 * at, n_columns) for at in standing), road=road)
     found = squared_distance(worlds.release(CappedSettings(cap=4)), np.ones((T, n_columns), bool))

@@ -49,7 +49,7 @@ def test_aggregates_and_vehicles_are_those_of_the_second_and_groups_see_some_of_
 
 def test_an_empty_segment_has_its_own_limit_and_a_density_its_own_length():
     road = UNEVEN.replaced(duration=T)
-    n_columns = road.geometry.n_segments + road.geometry.n_boundaries
+    n_columns = road.geometry.n_cells
     whole = crowd(seed=3, last=n_columns, n_columns=n_columns)
     table = Traffic(road, (0,), Worlds(whole))
     table.load(0)

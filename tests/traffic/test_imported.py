@@ -37,9 +37,9 @@ def original(tmp_path_factory):
 def write(folder, variants):
     records = {seed: synthetic(variant) for seed, variant in zip(SEEDS, variants, strict=True)}
     for seed, record in records.items():
-        save_record(folder, seed, FREE.record_layout, record)
+        save_record(folder, seed, FREE, record)
     digests = {seed: record.digest for seed, record in records.items()}
-    digest = write_manifest(folder, FREE.record_layout, digests, [])
+    digest = write_manifest(folder, FREE, digests, [])
     corridor = FREE.replaced(recordings=Recordings(str(folder), digest))
     write_corridor(folder / "road.toml", corridor)
     return corridor
@@ -50,7 +50,7 @@ def synthetic(variant):
     return Record(
         step=steps, vehicle=np.full(len(steps), variant), segment=steps % 6,
         speed=np.full(len(steps), 50.0 + variant), n_steps=FREE.conditions.duration + 1,
-        n_columns=FREE.geometry.n_segments + FREE.geometry.n_boundaries,
+        n_columns=FREE.geometry.n_cells,
     )  # fmt: skip
 
 
@@ -121,7 +121,7 @@ def test_a_damaged_manifest_is_an_error(change, message, recorded):
     with pytest.raises(InvalidRecordError, match=message):
         recorded_seeds(recorded.recordings)
     folder = recorded.recordings.folder
-    digest = write_manifest(Path(folder), FREE.record_layout, {"x" * 1000: ""}, [])
+    digest = write_manifest(Path(folder), FREE, {"x" * 1000: ""}, [])
     with pytest.raises(InvalidRecordError, match=r"manifest\.json: records must have .{1,150}$"):
         recorded_seeds(Recordings(folder, digest))
     manifest.unlink()

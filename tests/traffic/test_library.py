@@ -37,7 +37,7 @@ def forbid_recording(monkeypatch):
 def tiny_record(path, seed):
     """Put a record of one row where the library looks for one."""
     one = np.ones(1)
-    columns = SHORT_HIGHWAY.geometry.n_segments + SHORT_HIGHWAY.geometry.n_boundaries
+    columns = SHORT_HIGHWAY.geometry.n_cells
     record = Record(
         step=one, vehicle=one, segment=one, speed=one,
         n_steps=SHORT_HIGHWAY.conditions.duration + 1, n_columns=columns,

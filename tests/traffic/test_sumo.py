@@ -51,7 +51,7 @@ def route(corridor, origin, end):
     if end != MAINLINE:
         leave = [
             *corridor.geometry.off_ramp_segments[end],
-            s + 2 + corridor.geometry.n_on_ramps + end,
+            s + 2 + len(corridor.geometry.on_ramps) + end,
         ]
         last = corridor.geometry.off_ramps[end]
     return [*entry, *range(first, last), *leave]

@@ -74,7 +74,7 @@ def section(number: int) -> Corridor:
             cut = Section(number, SEGMENTS, windows=1, seconds=SECONDS)
             road = read_corridor(cut.write(Path(work), RecordLibrary()))
             assert road.recordings is not None
-            record = load_record(road.recordings, 0, road.record_layout)
+            record = load_record(road, road.recordings, 0)
         kept = save_records(folder, road, [record], [{"seed": number}])
         write_corridor(folder / ROAD, road.replaced(recordings=kept))
 

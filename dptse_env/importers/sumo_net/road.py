@@ -113,7 +113,7 @@ def import_road(
 def _unused(corridor: Corridor, names: Sequence[str], first: IntArray) -> Iterator[str]:
     """Yield the entrances and exits that no vehicle takes, for people."""
     road = corridor.geometry
-    N, S, n_on = road.n_mainline, road.n_segments, road.n_on_ramps
+    N, S, n_on = road.n_mainline, road.n_segments, len(road.on_ramps)
     ends = ["enters at the upstream end", "leaves at the downstream end"]
     ramps = [f"{'enters by' if i < n_on else 'leaves by'} {name}" for i, name in enumerate(names)]
     for i, text in enumerate([*ends, *ramps]):
@@ -152,7 +152,7 @@ def _draft(
     road = segments.geometry
     if speed_limit is not None:
         road = dataclasses.replace(road, speed_limit=speed_limit, ramp_speed_limit=None)
-    N, n_on, n_off = road.n_mainline, road.n_on_ramps, road.n_off_ramps
+    N, n_on, n_off = road.n_mainline, len(road.on_ramps), len(road.off_ramps)
     return Corridor(
         name=name,
         geometry=road,
@@ -182,7 +182,7 @@ def _demand(corridor: Corridor, first: IntArray) -> Demand:
         return tuple((float(time), round(float(rate), 1)) for time, rate in pairs)
 
     road = corridor.geometry
-    N, S, n_on = road.n_mainline, road.n_segments, road.n_on_ramps
+    N, S, n_on = road.n_mainline, road.n_segments, len(road.on_ramps)
     ramps = [np.minimum(first[:, N + i], first[:, S + 2 + i]) for i in range(n_on)]
     return Demand(mainline=rates(first[:, S]), on_ramps=tuple(map(rates, ramps)))
 
@@ -195,7 +195,7 @@ def _exit_shares(corridor: Corridor, first: IntArray) -> Iterator[float]:
         return found
 
     road = corridor.geometry
-    N, S, n_on = road.n_mainline, road.n_segments, road.n_on_ramps
+    N, S, n_on = road.n_mainline, road.n_segments, len(road.on_ramps)
     for i, face in enumerate(road.off_ramps):
         left = reached(N + n_on + i, S + 2 + n_on + i)
         passed = reached(S, *range(face)) & reached(*range(face, N), S + 1) & ~left

@@ -17,7 +17,7 @@ HORIZON = 40
 ROAD = SHORT_HIGHWAY.replaced(
     duration=HORIZON, demand=Demand(((0.0, 1000.0),), (100.0,)), incident=None
 )
-N_COLUMNS = ROAD.geometry.n_segments + ROAD.geometry.n_boundaries
+N_COLUMNS = ROAD.geometry.n_cells
 SECONDS = np.arange(1, HORIZON + 1)
 
 
