@@ -161,8 +161,8 @@ def _draw(path: Path, corridor: Corridor, recording: Recording, record: Record) 
     """Draw points, density and speed of the first window over space and time."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
-    n = corridor.geometry.n_mainline
-    lengths = np.array(corridor.geometry.segment_lengths[:n])
+    road, n = corridor.geometry, corridor.geometry.n_mainline
+    lengths = corridor.road.lengths[:n]
     faces = np.concatenate([[0.0], np.cumsum(lengths)])
     times = np.arange(record.n_steps + 1) - 0.5
     counts = record.counts[:, :n]
@@ -172,7 +172,7 @@ def _draw(path: Path, corridor: Corridor, recording: Recording, record: Record) 
     colours: dict[str, Any] = {
         "cmap": "RdYlGn",
         "vmin": 0.0,
-        "vmax": corridor.geometry.largest_speed_limit,
+        "vmax": road.largest_speed_limit,
     }
     points = recording.points()
     shown = {} if points["speed"].null_count() else {"c": points["speed"], **colours}

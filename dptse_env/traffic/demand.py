@@ -14,6 +14,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from dptse_env.geometry import Share
+from dptse_env.utils.units import KMH
 from dptse_env.utils.validation import Interval, checked_fields, require
 
 Rate = Annotated[float, Interval(0, 100_000)]
@@ -296,5 +297,5 @@ class VehicleClass:
         """Return the attributes of SUMO's vehicle type, given the corridor's drivers."""
         values = (self.drivers or drivers).attributes() | {"length": f"{self.length:g}"}
         if self.largest_speed is not None:
-            values["maxSpeed"] = f"{self.largest_speed / 3.6:g}"
+            values["maxSpeed"] = f"{self.largest_speed / KMH:g}"
         return values

@@ -23,6 +23,7 @@ from xml.etree import ElementTree
 
 from dptse_env.traffic.demand import Incident, lowest_limit
 from dptse_env.utils.files import file_digest, open_unzipped
+from dptse_env.utils.units import KMH
 from dptse_env.utils.validation import Interval, checked_fields, require, shown
 
 Position = Annotated[float, Interval(0, 1e6)]
@@ -70,9 +71,6 @@ TOLERANCE = 0.01
 
 Remark = Callable[[str], object]
 """Takes a sentence for people."""
-
-KMH = 3.6
-"""Factor from m/s to km/h."""
 
 _PATH = "corridor.sumo"
 _FILE = re.compile(r"(^|[._-])(files?|output|dest|href)$|File$|Output$")
@@ -133,14 +131,8 @@ class SumoScenario:
         require(n_sums == n_files, f"{_PATH}.sha256", f"one for each of {n_files} files", n_sums)
         allowed = f"at most begin = {self.begin} s"
         require(self.warm_up <= self.begin, f"{_PATH}.warm_up", allowed, self.warm_up)
-        steps = 1.0 / self.step_length
-        allowed = "a whole part of a second"
-        require(
-            abs(steps - round(steps)) < 1e-9,
-            f"{_PATH}.step_length",
-            allowed,
-            self.step_length,
-        )
+        whole, allowed = 1.0 / self.step_length - self.substeps, "a whole part of a second"
+        require(abs(whole) < 1e-9, f"{_PATH}.step_length", allowed, self.step_length)
         self._check_options()
         self._check_columns()
 
@@ -153,23 +145,15 @@ class SumoScenario:
             require(TRAFFIC.fullmatch(match[1]) is not None, f"{_PATH}.options", allowed, option)
 
     def _check_columns(self) -> None:
-        taken: dict[str, list[tuple[float, float]]] = {}
         for i, stretches in enumerate(self.columns):
             path = f"{_PATH}.columns[{i}]"
             require(bool(stretches), path, "at least one stretch of an edge", stretches)
-            for edge, start, end in stretches:
+            for _, start, end in stretches:
                 require(start < end, path, "stretches that end after they start", (start, end))
-                taken.setdefault(edge, []).append((start, end))
-        for edge, parts in taken.items():
-            parts.sort()
-            for (_, end), (start, _) in pairwise(parts):
-                apart = end <= start + TOLERANCE
-                require(
-                    apart,
-                    f"{_PATH}.columns",
-                    f"without overlap on edge {edge!r}",
-                    (start, end),
-                )
+        for edge, parts in _by_edge(self.columns).items():
+            for (_, end, _), (start, _, _) in pairwise(parts):
+                apart, allowed = end <= start + TOLERANCE, f"without overlap on edge {edge!r}"
+                require(apart, f"{_PATH}.columns", allowed, (start, end))
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -219,32 +203,23 @@ class SumoScenario:
                 )
 
 
-class Places:
-    """Places of the record columns on the edges of a net.
+def _by_edge(
+    columns: tuple[tuple[Stretch, ...], ...],
+) -> dict[str, list[tuple[float, float, int]]]:
+    """Return start, end and column of the stretches of each edge, in the direction of travel."""
+    parts: dict[str, list[tuple[float, float, int]]] = {}
+    for column, stretches in enumerate(columns):
+        for edge, start, end in stretches:
+            parts.setdefault(edge, []).append((start, end, column))
+    return {edge: sorted(of_edge) for edge, of_edge in parts.items()}
 
-    Args:
-        columns: as in `SumoScenario`.
-    """
 
-    def __init__(self, columns: tuple[tuple[Stretch, ...], ...]) -> None:
-        """Sort the stretches by edge."""
-        parts: dict[str, list[tuple[float, float, int]]] = {}
-        for column, stretches in enumerate(columns):
-            for edge, start, end in stretches:
-                parts.setdefault(edge, []).append((start, end, column))
-        self._parts = {edge: sorted(of_edge) for edge, of_edge in parts.items()}
-
-    def __iter__(self) -> Iterator[str]:
-        """Iterate over the edges, by the first column that each is a part of."""
-        return iter(self._parts)
-
-    def find(self, edge: str, position: float) -> int | None:
-        """Return the column of a position [m] on an edge; None where nothing is recorded."""
-        parts = self._parts[edge]
-        index = bisect_right(parts, position + TOLERANCE, key=itemgetter(0)) - 1
-        if index < 0 or position > parts[index][1] + TOLERANCE:
-            return None
-        return parts[index][2]
+def _column(parts: list[tuple[float, float, int]], position: float) -> int | None:
+    """Return the column of a position [m], given an edge's parts; None where there is none."""
+    index = bisect_right(parts, position + TOLERANCE, key=itemgetter(0)) - 1
+    if index < 0 or position > parts[index][1] + TOLERANCE:
+        return None
+    return parts[index][2]
 
 
 def command(folder: Path, files: SumoScenario, seed: int, scale: float) -> list[str]:
@@ -292,16 +267,16 @@ def observe(
     Returns:
         A row for each vehicle and second: second, vehicle, column of the record, speed [km/h].
     """
-    places, vehicle = Places(files.columns), libsumo.vehicle
+    places, vehicle = _by_edge(files.columns), libsumo.vehicle
     vehicles_on, position_of = libsumo.edge.getLastStepVehicleIDs, vehicle.getLanePosition
     limits = VehicleLimits(libsumo, incidents)
     numbers: dict[str, int] = {}
     rows: list[tuple[int, int, int, float]] = []
     for second in seconds:
         affected: dict[str, int] = {}
-        for edge in places:
+        for edge, parts in places.items():
             for name in vehicles_on(edge):
-                column = places.find(edge, position_of(name))
+                column = _column(parts, position_of(name))
                 if column is None:
                     continue
                 number = numbers.setdefault(name, len(numbers))

@@ -308,7 +308,7 @@ def _dwell(record: Record, corridor: Corridor) -> tuple[float, float]:
     """Return the time of vehicles on mainline segments [s] in a record, and their passages."""
     n = corridor.geometry.n_mainline
     if record.field is not None:
-        vehicles = record.field[:, :n, 0] * np.array(corridor.geometry.segment_lengths[:n])
+        vehicles = record.field[:, :n, 0] * corridor.road.lengths[:n]
         passing = record.field[:, :n].prod(axis=-1)
         return float(vehicles.sum()), float(passing.sum()) / HOUR
     mainline = record.segment < n

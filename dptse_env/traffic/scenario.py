@@ -120,12 +120,11 @@ def _exits(
     generator: np.random.Generator,
 ) -> NDArray[np.int64]:
     """Let each vehicle choose at each diverge that it passes, until it has left."""
-    entry_face = np.array([*corridor.geometry.on_ramps, 0], dtype=np.int64)[origins]
+    road = corridor.geometry
+    entry_face = np.array([*road.on_ramps, 0], dtype=np.int64)[origins]
     exits = np.full(len(origins), MAINLINE, dtype=np.int64)
-    profiles = demand.exit_shares or tuple(
-        ((0.0, share),) for share in corridor.geometry.exit_shares
-    )
-    for ramp, (face, profile) in enumerate(zip(corridor.geometry.off_ramps, profiles, strict=True)):
+    profiles = demand.exit_shares or tuple(((0.0, share),) for share in road.exit_shares)
+    for ramp, (face, profile) in enumerate(zip(road.off_ramps, profiles, strict=True)):
         leaves = generator.random(len(origins)) < value_at(profile, departures)
         exits[leaves & (exits == MAINLINE) & (entry_face < face)] = ramp
     return exits

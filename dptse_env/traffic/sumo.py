@@ -27,10 +27,11 @@ import numpy as np
 from dptse_env.traffic import own_sumo
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.demand import Incident, lowest_limit
-from dptse_env.traffic.own_sumo import KMH, WARNING, Remark
+from dptse_env.traffic.own_sumo import WARNING, Remark
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import Scenario, draw_scenario
 from dptse_env.traffic.sumo_input import LONGEST_OUTPUT, edge_ids, net_xml, routes_xml
+from dptse_env.utils.units import KMH
 
 SUPPORTED_SUMO = "1.28"
 """Release series that records are made with: others simulate the same scenario differently."""

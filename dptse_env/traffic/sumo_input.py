@@ -25,6 +25,7 @@ from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.roads import SHIPPED_CORRIDORS
 from dptse_env.traffic.scenario import MAINLINE, Scenario
 from dptse_env.utils.registry import missing_extra
+from dptse_env.utils.units import KMH
 
 LANE_WIDTH_M = 3.2
 RAMP_ANGLE = math.radians(45.0)  # a flat ramp would stretch the junction over half a segment
@@ -199,7 +200,7 @@ class _PlainXML:
             self._content["edges"].append(
                 f'<edge id="{name}" from="{nodes[k]}" to="{nodes[k + 1]}" spreadType="center" '
                 f'numLanes="{geometry.segment_lanes[cell]}" length="{self.lengths_m[cell]:.2f}" '
-                f'speed="{geometry.speed_limits[cell] / 3.6:.4f}"'
+                f'speed="{geometry.speed_limits[cell] / KMH:.4f}"'
                 + (f' shape="{shape}"/>' if face in nodes[k : k + 2] else "/>")
             )
 

@@ -2,3 +2,6 @@
 
 HOUR = 3600.0
 """An hour [s]."""
+
+KMH = 3.6
+"""A metre a second [km/h]."""

@@ -21,6 +21,7 @@ from dptse_env.importers.sumo_net.net import (
 )
 from dptse_env.model.parameters import load_parameters
 from dptse_env.traffic.own_sumo import TOLERANCE, Stretch
+from dptse_env.utils.units import KMH
 from dptse_env.utils.validation import require, shown
 
 PARAMETERS = "w99-3lane"
@@ -231,11 +232,11 @@ class Chain:
 
     def limit(self, start: float, end: float) -> float:
         """Return the speed limit between two distances [m]: the speed of a free crossing [km/h]."""
-        return 3.6 / sum(share / _limit(edge) for edge, share in self._shares(start, end))
+        return KMH / sum(share / _limit(edge) for edge, share in self._shares(start, end))
 
     def shortest(self, start: float, end: float) -> float:
         """Return the least length of segments between two distances [m]."""
-        return max(SHORTEST, SECONDS_ON_SEGMENT * self.limit(start, end) / 3.6)
+        return max(SHORTEST, SECONDS_ON_SEGMENT * self.limit(start, end) / KMH)
 
     def _shares(self, start: float, end: float) -> Iterator[tuple[Any, float]]:
         for edge, low, high in zip(self.edges, self._starts, self.ends, strict=True):
