@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from dptse_env.importers.folder import ROAD, save_records
+from dptse_env.importers.folder import ROAD
 from dptse_env.importers.measured import measure
 from dptse_env.traffic import Conditions, Corridor, Geometry, Record, RecordLibrary, Scales
 from dptse_env.traffic.demand import Demand, Drivers, Incident, VehicleClass
-from dptse_env.traffic.imported import Kind
+from dptse_env.traffic.imported import Kind, save_records
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.arrays import FloatArray, IntArray
 

@@ -18,14 +18,13 @@ from dptse_env.importers.folder import (
     assign_seeds,
     moved,
     new_folder,
-    save_records,
 )
 from dptse_env.importers.measured import with_measured
 from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
 from dptse_env.importers.units import odd_unit
 from dptse_env.traffic.corridor import Conditions, Corridor, Scales
 from dptse_env.traffic.demand import Demand
-from dptse_env.traffic.imported import ranges
+from dptse_env.traffic.imported import ranges, save_records
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray

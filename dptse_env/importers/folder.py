@@ -21,8 +21,8 @@ from dptse_env.importers.recording import Options, Recording
 from dptse_env.importers.report import write_report
 from dptse_env.importers.source import Source
 from dptse_env.importers.tables import FORMATS
-from dptse_env.traffic.corridor import Corridor, Recordings
-from dptse_env.traffic.imported import Kind, load_record, ranges, save_record, write_manifest
+from dptse_env.traffic.corridor import Corridor
+from dptse_env.traffic.imported import load_record, ranges, save_records
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.files import hidden, left_hidden, require_output
@@ -153,29 +153,6 @@ def import_trajectories(
         first = load(flat[0])
         report = write_report(folder, road, recordings, seeds, sources, first, notes)
     return Imported(moved(road, output), seeds, report)
-
-
-def save_records(
-    folder: Path, road: Corridor, records: Iterable[Record], sources: list[dict[str, Any]],
-    kind: Kind = "vehicles",
-) -> Recordings:  # fmt: skip
-    """Write records and their manifest to a folder, one after another.
-
-    Args:
-        folder: The folder.
-        road: The road.
-        records: A record for each source; each is asked for when the last one is written.
-        sources: A JSON description of each window, with its traffic ``seed``.
-        kind: Whether the records have vehicles or are measured fields.
-
-    Raises:
-        OSError: The folder cannot be written.
-    """
-    digests = {}
-    for source, record in zip(sources, records, strict=True):
-        save_record(folder, source["seed"], road, record)
-        digests[source["seed"]] = record.digest
-    return Recordings(str(folder), write_manifest(folder, road, digests, sources, kind))
 
 
 def moved(road: Corridor, output: Path) -> Corridor:

@@ -33,47 +33,40 @@ def record_path(folder: str | Path, seed: int) -> Path:
     return Path(folder) / "records" / f"{seed:08d}.safetensors"
 
 
-def save_record(folder: Path, seed: int, corridor: Corridor, record: Record) -> None:
-    """Write the record of a traffic seed to a folder whose manifest is written last.
-
-    Args:
-        folder: The folder of the recordings.
-        seed: The traffic seed.
-        corridor: The road that the record is made for.
-        record: The record.
-
-    Raises:
-        OSError: It cannot be written.
-    """
-    record.save(record_path(folder, seed), _source(seed, corridor))
-
-
-def write_manifest(
+def save_records(
     folder: Path,
     corridor: Corridor,
-    digests: Mapping[int, str],
+    records: Iterable[Record],
     sources: list[dict[str, Any]],
     kind: Kind = "vehicles",
-) -> str:
-    """Write the manifest of a folder whose records are complete; return its digest.
+) -> Recordings:
+    """Write records to a folder, one after another, and then its manifest.
 
     Args:
-        folder: The folder of the recordings.
+        folder: The folder.
         corridor: The road that they are made for.
-        digests: `Record.digest` of each record by traffic seed.
-        sources: JSON descriptions of the windows that they were cut from, for the reader.
+        records: A record for each source; each is asked for when the last one is written.
+        sources: A JSON description of each window, with its traffic ``seed``.
         kind: Whether the records have vehicles or are measured fields.
+
+    Raises:
+        OSError: The folder cannot be written.
     """
+    digests = {}
+    for source, record in zip(sources, records, strict=True):
+        seed = source["seed"]
+        record.save(record_path(folder, seed), _source(seed, corridor))
+        digests[str(seed)] = record.digest
     manifest = {
         "format": FORMAT,
         "version": VERSION,
         "kind": kind,
         "road": _layout(corridor),
-        "records": {str(seed): digest for seed, digest in digests.items()},
+        "records": digests,
         "sources": sources,
     }
     (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-    return _digest(manifest)
+    return Recordings(str(folder), _digest(manifest))
 
 
 def recorded_seeds(recordings: Recordings) -> tuple[int, ...]:

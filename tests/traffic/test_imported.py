@@ -1,5 +1,7 @@
 """Corridors with recordings: their records are read, never made."""
 
+import dataclasses
+import json
 import pickle
 import shutil
 from pathlib import Path
@@ -14,15 +16,15 @@ from dptse_env.traffic import (
     InvalidRecordError,
     Record,
     RecordingError,
-    Recordings,
     RecordLibrary,
     randomised,
     read_corridor,
     simulate,
     sumo,
 )
-from dptse_env.traffic.imported import record_path, recorded_seeds, save_record, write_manifest
+from dptse_env.traffic.imported import record_path, recorded_seeds, save_records
 from dptse_env.traffic.roads import write_corridor
+from dptse_env.utils.files import json_digest
 
 FREE = SHORT_HIGHWAY.replaced(incident=None)
 SEEDS = (0, 1, 1000, 2000)
@@ -35,12 +37,8 @@ def original(tmp_path_factory):
 
 
 def write(folder, variants):
-    records = {seed: synthetic(variant) for seed, variant in zip(SEEDS, variants, strict=True)}
-    for seed, record in records.items():
-        save_record(folder, seed, FREE, record)
-    digests = {seed: record.digest for seed, record in records.items()}
-    digest = write_manifest(folder, FREE, digests, [])
-    corridor = FREE.replaced(recordings=Recordings(str(folder), digest))
+    kept = save_records(folder, FREE, map(synthetic, variants), [{"seed": seed} for seed in SEEDS])
+    corridor = FREE.replaced(recordings=kept)
     write_corridor(folder / "road.toml", corridor)
     return corridor
 
@@ -117,13 +115,14 @@ def test_a_damaged_exchanged_or_missing_record_is_an_error(recorded, tmp_path):
 )
 def test_a_damaged_manifest_is_an_error(change, message, recorded):
     manifest = Path(recorded.recordings.folder) / "manifest.json"
+    content = json.loads(manifest.read_text()) | {"records": {"x" * 1000: ""}}
     manifest.write_text(change(manifest.read_text()))
     with pytest.raises(InvalidRecordError, match=message):
         recorded_seeds(recorded.recordings)
-    folder = recorded.recordings.folder
-    digest = write_manifest(Path(folder), FREE, {"x" * 1000: ""}, [])
+    manifest.write_text(json.dumps(content))
+    digest = json_digest({key: content[key] for key in content if key != "sources"})
     with pytest.raises(InvalidRecordError, match=r"manifest\.json: records must have .{1,150}$"):
-        recorded_seeds(Recordings(folder, digest))
+        recorded_seeds(dataclasses.replace(recorded.recordings, digest=digest))
     manifest.unlink()
     with pytest.raises(InvalidRecordError, match="recordings cannot be read"):
         recorded_seeds(recorded.recordings)

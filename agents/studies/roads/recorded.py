@@ -16,10 +16,10 @@ from filelock import FileLock
 from agents.filters import highways
 from agents.filters.highways import SLOW, Section
 from agents.studies.roads import idm as simulator
-from dptse_env.importers.folder import ROAD, new_folder, save_records
+from dptse_env.importers.folder import ROAD, new_folder
 from dptse_env.importers.measured import measure
 from dptse_env.traffic import Corridor, Record, RecordLibrary, read_corridor, write_corridor
-from dptse_env.traffic.imported import load_record
+from dptse_env.traffic.imported import load_record, save_records
 from dptse_env.traffic.library import CACHE_VARIABLE, default_path
 from dptse_env.utils.files import file_digest, require_writable
 
