@@ -128,7 +128,7 @@ def import_trajectories(
                 )
                 yield record
 
-        kept = save_records(folder, bare, records(), sources)
+        recorded = bare.replaced(recordings=save_records(folder, bare, records(), sources))
         notes = [
             f"no vehicle is ever on the {kind}-ramp at face {face}"
             for kind, faces, ramps in (
@@ -142,15 +142,12 @@ def import_trajectories(
             notes.append(f"windows begin on an empty mainline: traffic seeds {ranges(empty)}")
         notes += _overlaps(sources, corridor.conditions.duration)
 
-        def load(seed: int) -> Record:
-            return load_record(bare, kept, seed)
-
         # One at a time, so that one is in memory.
-        measured = measure(bare, lambda: map(load, seeds[splits[0].name]))
-        road = measured.replaced(recordings=kept)
+        training = seeds[splits[0].name]
+        road = measure(recorded, lambda: (load_record(recorded, seed) for seed in training))
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
         write_corridor(folder / ROAD, road, environment, comment)
-        first = load(flat[0])
+        first = load_record(recorded, flat[0])
         report = write_report(folder, road, recordings, seeds, sources, first, notes)
     return Imported(moved(road, output), seeds, report)
 

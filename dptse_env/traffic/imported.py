@@ -94,18 +94,19 @@ def require_seeds(recordings: Recordings, seeds: Iterable[int], path: str = "tra
         )
 
 
-def load_record(corridor: Corridor, recordings: Recordings, seed: int) -> Record:
+def load_record(corridor: Corridor, seed: int) -> Record:
     """Read the record of a traffic seed.
 
     Args:
-        corridor: The road that the record must be made for.
-        recordings: The folder.
+        corridor: A road with recordings, which must be made for it.
         seed: The traffic seed.
 
     Raises:
         ValueError: There is no record of the seed.
         InvalidRecordError: The record is damaged or another one, or made for another road.
     """
+    recordings = corridor.recordings
+    assert recordings is not None
     require_seeds(recordings, [integer("traffic seed", seed, 0)])
     manifest, path = _manifest(recordings), record_path(recordings.folder, seed)
     road = _layout(corridor)

@@ -184,7 +184,7 @@ class RecordLibrary:
 
     def _load_or_record(self, corridor: Corridor, seed: int) -> Record:
         if corridor.recordings is not None:
-            return load_record(corridor, corridor.recordings, seed)
+            return load_record(corridor, seed)
         path, source = self.record_path(corridor, seed), _source(corridor, seed)
         try:
             return Record.load(path, source, corridor.record_shape)

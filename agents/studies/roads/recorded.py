@@ -73,8 +73,7 @@ def section(number: int) -> Corridor:
         with tempfile.TemporaryDirectory() as work:
             cut = Section(number, SEGMENTS, windows=1, seconds=SECONDS)
             road = read_corridor(cut.write(Path(work), RecordLibrary()))
-            assert road.recordings is not None
-            record = load_record(road, road.recordings, 0)
+            record = load_record(road, 0)
         kept = save_records(folder, road, [record], [{"seed": number}])
         write_corridor(folder / ROAD, road.replaced(recordings=kept))
 

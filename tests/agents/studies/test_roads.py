@@ -147,7 +147,7 @@ def test_a_queue_through_the_end_is_told_from_one_inside():
 def test_sections_are_as_they_are_called():
     for queue, numbers in recorded.QUEUES.items():
         road = CORRIDORS.find(f"agents.studies.roads.recorded:section_{numbers[1]}")()
-        record = load_record(road, road.recordings, numbers[1])
+        record = load_record(road, numbers[1])
         assert recorded.queue_of(road, record) == queue
 
 
