@@ -89,7 +89,7 @@ class EnvConfig:
         backend: ``compiled``, or ``reference``, which EKF, UKF, EnKF and MHE have.
         parameters: ARZ parameters; a name stands for a shipped set.
         estimator_settings: Tuning of the estimator, or the name of a shipped set
-            (`dptse_env.estimators.settings`), whichever estimator it was tuned for. None for the
+            (`dptse_env.estimators.tuned`), whichever estimator it was tuned for. None for the
             set ``<estimator>-<ARZ parameters>-<privacy preset>-<corridor>``, or that without the
             corridor's name, if one ships, else the estimator's defaults. Parameters of one's own
             take those of the shipped ones that they were derived from.

@@ -3,6 +3,7 @@
 The links of the site are checked where it is built, by ``docs/_site/links.py``.
 """
 
+import pkgutil
 import re
 import runpy
 import tomllib
@@ -42,6 +43,13 @@ def test_a_moving_picture_is_small_and_has_a_still_beside_it():
     for path in moving:
         assert path.stat().st_size < 1_000_000
         assert path.with_suffix(".png").is_file()
+
+
+def test_what_docstrings_refer_to_is_there():
+    for path in (ROOT / "dptse_env").rglob("*.py"):
+        for name in re.findall(r"`(dptse_env(?:\.\w+)+)`", path.read_text(encoding="utf-8")):
+            if name != "dptse_env.plugins":  # the group of entry points
+                pkgutil.resolve_name(name)
 
 
 @pytest.mark.skipif(not (ROOT / "results").is_dir(), reason="a source archive has no results")

@@ -58,7 +58,7 @@ class ARZParameters:
         relaxation_time: tau [s]; infinite for no relaxation.
         lanes: Lanes of the road to which `jam_density` applies.
         derived_from: Shipped set whose tuned estimator settings a set of one's own takes
-            (`dptse_env.estimators.settings.tuned_with`); None for the default one.
+            (`dptse_env.estimators.tuned.tuned_with`); None for the default one.
 
     Raises:
         ValueError: A value is out of range, or there is no such shipped set.
