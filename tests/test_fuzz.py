@@ -51,6 +51,7 @@ def test_a_case_is_drawn_again_from_its_seed_and_number(tmp_path):
         assert drawn[0] == drawn[1] != drawn[2]
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_some_corridors_that_are_drawn_are_in_order():
     rng, n_made = np.random.default_rng(0), 0
     for _ in range(30):
