@@ -89,7 +89,8 @@ class Paced(ReleaseModel):
     (`dptse_env.release.pacing`). With mu the parameter of the guarantee of a group of channels, a
     vehicle has a budget of mu^2 / 2 there against its replacement by another, and of mu^2 against
     being added or removed; the mu^2 of the groups add up to that of all releases. The guarantee
-    holds for any query policy, any estimator and any pacing; ``docs/privacy/proof.md`` proves it.
+    holds for any query policy, any estimator and any positive prices; ``docs/privacy/proof.md``
+    proves it.
 
     Attributes:
         mu: Parameter of Gaussian differential privacy of each group, shape (groups,).

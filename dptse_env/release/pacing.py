@@ -220,7 +220,7 @@ def _pace(
                 price = 0.0
                 for s in range(first, last):
                     price += max(offered[g] - paid[s], least[g]) / rest[s]
-                price /= channels.span[c]
+                price *= 1.0 / channels.span[c]
                 prices[k, c] = price
                 if observed[k, c]:
                     for s in range(first, last):
