@@ -1,4 +1,4 @@
-"""What the estimator is given: boundary inputs, errors of detectors, and answers put together."""
+"""Inputs of the estimator: boundary inputs, errors of detectors, and answers put together."""
 
 from dptse_env.measurement.boundary import BOUNDARIES, BoundaryModel, nominal_state
 from dptse_env.measurement.fusion import Fusion, FusionSettings

@@ -1,4 +1,4 @@
-"""What kernels take beside a `dptse_env.road.Road`: channels, and numbers of the model."""
+"""Arguments of kernels beside a `dptse_env.road.Road`: channels, and numbers of the model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 
 class Channels(NamedTuple):
-    """What is measured: C sums or averages over neighbouring cells, which have two numbers each.
+    """C sums or averages over neighbouring cells, which are measured and have two numbers each.
 
     The first M are those that estimators are given; those of boundary cells follow.
     """

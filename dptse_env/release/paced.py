@@ -295,7 +295,7 @@ class Paced(ReleaseModel):
 
 
 class _Accounts(NamedTuple):
-    """What is published of a release."""
+    """Numbers of a release that are published."""
 
     ratio: float
     is_event: bool

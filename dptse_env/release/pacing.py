@@ -80,7 +80,7 @@ class Pacing(ABC):
 
 
 class Paces(NamedTuple):
-    """What a `TripPacing` offers, and its public state of n episodes."""
+    """Offers of a `TripPacing`, and its public state of n episodes."""
 
     offered: FloatArray  # (groups,) part of each group's budget that a trip should spend
     least: FloatArray  # (groups,) least that is offered for the rest of a trip

@@ -1,4 +1,4 @@
-"""What is measured of a road, and the request for a second of it."""
+"""The channels that are measured of a road, and the request for a second of them."""
 
 from __future__ import annotations
 

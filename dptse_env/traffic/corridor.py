@@ -45,7 +45,7 @@ gives the dwell. Records of the shipped roads, with their jams, have 2.8 to 2.9.
 
 @dataclass(frozen=True)
 class Conditions:
-    """What drives on a road, and for how long.
+    """Traffic of a road, and its duration.
 
     Attributes:
         demand: arrival rates, fixed or drawn per traffic seed.
