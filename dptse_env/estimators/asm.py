@@ -49,14 +49,13 @@ within reach is of A seconds ago the variances c_1 lanes^2 and c_2 are added, ti
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate, KernelEstimator, Measurement
+from dptse_env.estimators.base import Measurement, SegmentEstimator
 from dptse_env.estimators.settings import AdaptiveSmoothingSettings, EstimatorSettings
-from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
 from dptse_env.model.arrays import ARZ, Channels
 from dptse_env.model.step import pressure
@@ -146,7 +145,7 @@ def make_stencil(model: ARZModel, settings: AdaptiveSmoothingSettings) -> Stenci
         delay=delay,
         weight=np.array([line[3] for line in lines]),
         first=np.array(first, dtype=np.int64),
-        flows=model.centre is not None,
+        flows=model.releases_flow,
         decay=math.exp(-step / settings.time),
         threshold=float(settings.threshold),
         transition=float(settings.transition),
@@ -479,7 +478,7 @@ def _add(stencil: Stencil, state: State, e: int, s: int, value: FloatArray) -> N
         state.age[e, stencil.target[q]] = 0.0
 
 
-class AdaptiveSmoothing(KernelEstimator):
+class AdaptiveSmoothing(SegmentEstimator):
     """Adaptive smoothing of released values.
 
     It has no traffic model; the ARZ parameters serve to read densities and speeds off the model's
@@ -489,8 +488,7 @@ class AdaptiveSmoothing(KernelEstimator):
         state: Sums and estimates, which predictions and updates change in place.
     """
 
-    has_demand: ClassVar[bool] = False
-    steps_model: ClassVar[bool] = False
+    restart_kernel = staticmethod(restart)
     predict_kernel = staticmethod(predict)
     update_kernel = staticmethod(update)
 
@@ -503,30 +501,12 @@ class AdaptiveSmoothing(KernelEstimator):
             past=np.zeros(shape),
             place=np.zeros(n, dtype=np.int64),
             sums=np.zeros((n, S, 2, 5)),
-            present=np.zeros((n, S, 4)),
-            priors=np.zeros((n, S, 4)),
+            present=self.present,
+            priors=self.priors,
             smoothed=np.zeros((n, S, 2)),
             age=np.zeros((n, S)),
             evidence=np.zeros((n, S, 2, 2)),
             innovations=self.innovations,
             diverged=self.diverged,
         )
-        scale = np.array([model.density_scale, model.speed_scale])
-        self.state.priors[..., 2:] = np.sqrt(settings.initial_variance) * scale
-        self.state.present[:] = self.state.priors
         self.arrays = Bundle(model.road, model.arz, model.channels, stencil, self.state)
-
-    @property
-    def means(self) -> FloatArray:
-        """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
-        return self.state.present[..., :2]
-
-    def _reset(
-        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
-    ) -> None:
-        density, speed = estimated_traffic(self.model, states)
-        self.state.priors[episodes, :, 0], self.state.priors[episodes, :, 1] = density, speed
-        restart(self.arrays, episodes)
-
-    def _estimate(self) -> Estimate:
-        return Estimate(*(self.state.present[..., j].copy() for j in range(4)))

@@ -306,3 +306,48 @@ class KernelEstimator(Estimator):
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
         self.update_kernel(self.arrays, episodes, measured)
+
+
+class SegmentEstimator(KernelEstimator):
+    """Estimator of densities and speeds by two kernels that do not step the traffic model.
+
+    Attributes:
+        present: Densities [veh/km], speeds [km/h] and deviations of both, shape (n, S, 4).
+        priors: Those that episodes begin with, likewise.
+    """
+
+    has_demand: ClassVar[bool] = False
+    steps_model: ClassVar[bool] = False
+    restart_kernel: ClassVar[Callable[..., None]]
+    """Kernel of the arrays and episodes, which begins these with their priors."""
+
+    def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
+        """See `make_estimator`."""
+        super().__init__(model, n_episodes, settings)
+        self.priors = np.zeros((n_episodes, model.n_segments, 4))
+        scale = np.array([model.density_scale, model.speed_scale])
+        self.priors[..., 2:] = np.sqrt(settings.initial_variance) * scale
+        self.present = self.priors.copy()
+
+    @property
+    def means(self) -> FloatArray:
+        """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
+        return self.present[..., :2]
+
+    def _reset(
+        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> None:
+        density, speed = estimated_traffic(self.model, states)
+        self.priors[episodes, :, 0], self.priors[episodes, :, 1] = density, speed
+        self.restart_kernel(self.arrays, episodes)
+
+    def _estimate(self) -> Estimate:
+        return Estimate(*(self.present[..., j].copy() for j in range(4)))
+
+
+def estimated_traffic(model: ARZModel, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return density [veh/km] and speed [km/h] of states, the speed at most 1.1 v_f.
+
+    In the cone it never exceeds that; in the paper's box w = psi / rho has no bound.
+    """
+    return model.density(states), np.minimum(model.speed(states), model.largest_speed)

@@ -122,7 +122,7 @@ class Mixture(Estimator):
         """Return errors (k, M, 2) of predicted releases, and their variances."""
         density, speed, density_std, speed_std = estimate
         second, variance = speed, speed_std**2
-        if self.model.centre is not None:
+        if self.model.releases_flow:
             slip = speed - measured.centre
             second = density * slip
             variance = (density * speed_std) ** 2 + (slip * density_std) ** 2

@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate, KernelEstimator
+from dptse_env.estimators.base import SegmentEstimator
 from dptse_env.estimators.recurrent_kernels import (
     FEATURES,
     LONGEST_AGE,
@@ -29,10 +29,9 @@ from dptse_env.estimators.recurrent_kernels import (
     update,
 )
 from dptse_env.estimators.settings import EstimatorSettings
-from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
-from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray
 from dptse_env.utils.files import read_tensors, require_arrays, write_tensors
 from dptse_env.utils.kernels import Bundle
 
@@ -46,7 +45,7 @@ SHIPPED = ("highway", "long-highway", "roads")
 _FOLDER, _SUFFIX = Path(__file__).parent / "weights", ".safetensors"
 
 
-class Recurrent(KernelEstimator):
+class Recurrent(SegmentEstimator):
     """A gated recurrent unit in every cell of the road (`recurrent_kernels`).
 
     All cells have the same weights. A cell reads the releases that cover it, the prediction of its
@@ -59,42 +58,37 @@ class Recurrent(KernelEstimator):
         hidden: Hidden states, shape (n, S, H).
     """
 
-    has_demand: ClassVar[bool] = False
-    steps_model: ClassVar[bool] = False
+    restart_kernel = staticmethod(restart)
     predict_kernel = staticmethod(predict)
     update_kernel = staticmethod(update)
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        flows = model.centre is not None
+        flows = model.releases_flow
         self.saved = weights_for(settings.recurrent.weights, model.road, flows)
         S, n = model.n_segments, n_episodes
-        self._memory = Memory(
+        memory = Memory(
             inputs=np.zeros((n, model.n_inputs)),
-            present=np.zeros((n, S, 4)),
+            present=self.present,
             age=np.full((n, S), LONGEST_AGE),
             innovations=self.innovations,
         )
-        self._state = State(
+        state = State(
             hidden=np.zeros((n, S, self.saved.weights.width), dtype=np.float32),
             ahead=np.zeros((n, S, 4)),
-            priors=np.zeros((n, S, 4)),
+            priors=self.priors,
             diverged=self.diverged,
         )
-        scale = np.array([model.density_scale, model.speed_scale])
-        self._state.priors[..., 2:] = np.sqrt(settings.initial_variance) * scale
-        self._memory.present[:] = self._state.priors
-        self.hidden = self._state.hidden
+        self.hidden = state.hidden
         self.arrays = Bundle(
-            model.road, model.channels, make_cells(model), self._memory, self.saved.weights,
-            self._state,
+            model.road, model.channels, make_cells(model), memory, self.saved.weights, state
         )  # fmt: skip
 
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
         """Refuse weights that are missing or cannot be read."""
-        flows = model.centre is not None
+        flows = model.releases_flow
         weights_for(settings.recurrent.weights, model.road, flows)
 
     @classmethod
@@ -112,21 +106,6 @@ class Recurrent(KernelEstimator):
         saved = weights_for(settings.recurrent.weights, road, flows)
         is_outside = outside(saved, road, flows, largest_span)
         return ("estimator_settings.recurrent.weights",) if is_outside else ()
-
-    @property
-    def means(self) -> FloatArray:
-        """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
-        return self._memory.present[..., :2]
-
-    def _reset(
-        self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
-    ) -> None:
-        density, speed = estimated_traffic(self.model, states[:, : 2 * self.model.n_segments])
-        self._state.priors[episodes, :, 0], self._state.priors[episodes, :, 1] = density, speed
-        restart(self.arrays, episodes)
-
-    def _estimate(self) -> Estimate:
-        return Estimate(*(self._memory.present[..., j].copy() for j in range(4)))
 
 
 def outside(saved: SavedWeights, road: Road, flows: bool, largest_span: int) -> list[str]:

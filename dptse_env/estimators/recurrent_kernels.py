@@ -103,7 +103,7 @@ def make_cells(model: ARZModel) -> Cells:
     return Cells(
         unit=DENSITY_UNIT * road.lanes,
         limit=float(limits.max()),
-        flows=model.centre is not None,
+        flows=model.releases_flow,
         fixed=np.concatenate([marks, lanes[:, None] / 3.0, scales], axis=1),
     )
 

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from scipy.linalg import LinAlgError, LinAlgWarning
 from scipy.sparse.linalg import splu
 
-from dptse_env.estimators.base import Estimate, Estimator, Measurement
+from dptse_env.estimators.base import Estimate, Estimator, Measurement, estimated_traffic
 from dptse_env.estimators.ekf import count_variance, initial_variance, process_variance
 from dptse_env.estimators.enkf import make_tapers
 from dptse_env.estimators.mhe import (
@@ -28,7 +28,6 @@ from dptse_env.estimators.mhe import (
 )
 from dptse_env.estimators.normals import draw, make_stream
 from dptse_env.estimators.settings import EstimatorSettings
-from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.estimators.window import AT_BOUND
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import Bounds

@@ -5,7 +5,13 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate, Estimator, KernelEstimator, Measurement
+from dptse_env.estimators.base import (
+    Estimate,
+    Estimator,
+    KernelEstimator,
+    Measurement,
+    estimated_traffic,
+)
 from dptse_env.estimators.ekf import EKF
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -99,7 +105,7 @@ class RandomWalk(KernelEstimator):
 
     Means are clipped to [0, rho_m] and [0, 1.1 v_f]. A released flow rho (v - v_0) is converted to
     a speed by the density just estimated, which is treated as exact and at least a hundredth of
-    rho_m. A row of several segments corrects each of them by its share of the uncertainty; the
+    rho_m. A channel of several segments corrects each of them by its share of the uncertainty; the
     covariance of their errors is dropped.
 
     Attributes:
@@ -278,11 +284,3 @@ class OpenLoop(Estimator):
     def _estimate(self) -> Estimate:
         density, speed = estimated_traffic(self.model, self.states)
         return Estimate(density, speed, np.zeros_like(density), np.zeros_like(speed))
-
-
-def estimated_traffic(model: ARZModel, states: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return density [veh/km] and speed [km/h] of states, the speed at most 1.1 v_f.
-
-    In the cone it never exceeds that; in the paper's box w = psi / rho has no bound.
-    """
-    return model.density(states), np.minimum(model.speed(states), model.largest_speed)

@@ -131,7 +131,7 @@ class PrivateBoundary(NominalBoundary):
         # Not np.clip, which takes several times as long on so few numbers.
         density = np.minimum(np.maximum(released[..., 0], 0.0), self._jam_density)
         speed = released[..., 1]
-        if model.centre is not None:
+        if model.releases_flow:
             centre = measured.centre[:, model.n_segments :]
             speed = speed / np.maximum(density, self._least_density) + centre
             speed[density < self._least_density] = model.parameters.free_flow_speed

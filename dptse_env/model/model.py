@@ -93,7 +93,8 @@ class ARZModel:
         first, span = self.channels.first, self.channels.span
         if not ((first >= 0) & (span >= 1) & (first + span <= self.n_segments)).all():
             raise ValueError(f"model.channels must cover segments in 0..{self.n_segments - 1}")
-        if centre is None and not (span == 1).all():
+        self._are_segments = bool((span == 1).all())
+        if centre is None and not self._are_segments:
             raise ValueError("model.channels must be segments where mean speeds are released")
         self.centre: float | None = None
         second = self.speed_scale
@@ -113,7 +114,7 @@ class ARZModel:
         )
         self.jam_density = self.arz.jam[: self.n_segments]
 
-    @property
+    @cached_property
     def dynamics(self) -> tuple[Road, ARZ, Channels]:
         """Road, numbers of the model and channels, for kernels that step the model.
 
@@ -123,9 +124,14 @@ class ARZModel:
         self.require_time_step()
         return self.road, self.arz, self.channels
 
+    @property
+    def releases_flow(self) -> bool:
+        """True where flows are measured, False where mean speeds are."""
+        return self.centre is not None
+
     def averages(self, values: FloatArray) -> FloatArray:
         """Averages `(n, M, 2)` over the segments of each channel of values `(n, S, 2)`."""
-        if (self.channels.span == 1).all():
+        if self._are_segments:
             return values[:, self.channels.first]
         averages: FloatArray = np.einsum("ms,nsk->nmk", self.averaging, values)
         return averages

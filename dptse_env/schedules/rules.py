@@ -302,7 +302,7 @@ class ExpectedReduction(ProcessSchedule):
             table[episodes, :n]
             for table in (estimate.density, estimate.density_std, estimate.speed_std)
         )
-        flows = self.process.model.centre is not None
+        flows = self.process.model.releases_flow
         carrier = np.maximum(density, LEAST_DENSITY) if flows else np.ones_like(density)
         value = self._of_density * _reduction(density_std**2, self._noise[0])
         value += self._of_speed * _reduction(speed_std**2, self._noise[1] / carrier**2)

@@ -92,7 +92,7 @@ class PlainPacing:
         return np.array(list(prices.values()))
 
     def carried(self, density, speed):
-        """What is spent after predicted flows have mixed it for a second."""
+        """Spent shares after predicted flows have mixed them for a second."""
         road, old, new = self.road, self.spent, self.spent.copy()
         flow = density * speed
         for s, length in enumerate(self.lengths):

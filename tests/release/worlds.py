@@ -46,7 +46,7 @@ def streams(*seeds):
 
 
 def task_of(model, settings, road, queries, n_episodes=1, groups=WHOLE):
-    """What a release model of a class measures of a road in a batch of episodes."""
+    """The task of a class of release models on a road, in a batch of episodes."""
     return Task(
         settings.preset, settings, road, queries, road.conditions.duration,
         model.centre(road, settings), model.has_prices, n_episodes, groups,
