@@ -343,7 +343,7 @@ class SumRelease(ReleaseModel):
         every = corridor.geometry.n_cells
         values = self.traffic.aggregates(request.traffic, request.times, every)
         values[..., 1] = values[..., 0] * (values[..., 1] - 0.5 * corridor.geometry.speed_limit)
-        weights = task.covers / task.channels.span[:, None]
+        weights = task.channels.averaging(task.n_cells)
         return np.einsum("cs,nsk->nck", weights, values[:, : task.n_cells])
 
     def release(self, request):

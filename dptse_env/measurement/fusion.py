@@ -61,11 +61,10 @@ class Fusion:
         """Prepare for the queries of a task, with the published share p of connected vehicles."""
         self.settings, self.share = settings, share
         self.releases_flow = task.releases_flow
-        self._queries = queries = slice(0, task.queries.n_queries)
-        self._length = task.channels.length[queries]
-        self._limit = task.corridor.road.limits[task.channels.first[queries]]
-        covers = task.covers[queries, : task.corridor.road.n_segments]
-        self._weights = (covers / task.channels.span[queries, None]).T  # (S, G)
+        road, queries = task.corridor.road, task.channels.head(task.queries.n_queries)
+        self._queries = slice(0, queries.size)
+        self._length, self._limit = queries.length, road.limits[queries.first]
+        self._weights = queries.averaging(road.n_segments).T  # (S, G)
 
     def scaled(self, sigma: FloatArray) -> FloatArray:
         """Return deviations (2,) of a query's noise, scaled to all vehicles."""

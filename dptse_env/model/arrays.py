@@ -41,6 +41,11 @@ class Channels(NamedTuple):
         """Return flags of the cells that each channel covers, shape (C, n_cells)."""
         return covered(self.first, self.span, n_cells)
 
+    def averaging(self, n_cells: int) -> FloatArray:
+        """Return weights of cells in the averages of channels, shape (C, n_cells)."""
+        weights: FloatArray = self.covers(n_cells) / self.span[:, None]
+        return weights
+
     def __deepcopy__(self, memo: object) -> Channels:
         """Return the same arrays, which copies of an environment share."""
         return self

@@ -139,8 +139,7 @@ class ARZModel:
     @cached_property
     def averaging(self) -> FloatArray:
         """Weights of the segments in each channel, shape (M, S): 1 / span of those it covers."""
-        weights: FloatArray = self.channels.covers(self.n_segments) / self.channels.span[:, None]
-        return weights
+        return self.channels.averaging(self.n_segments)
 
     def require_time_step(self) -> None:
         """Raise ``ValueError`` where the time step violates the CFL condition on a segment."""
