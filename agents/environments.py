@@ -14,7 +14,8 @@ from gymnasium.vector import AutoresetMode
 from dptse_env.config import EnvConfig
 from dptse_env.env import SensorQueryEnv
 from dptse_env.evaluation import require_in_step
-from dptse_env.utils.validation import parse_json, require, shown
+from dptse_env.registration import ENVIRONMENTS
+from dptse_env.utils.validation import parse_json, require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 OTHER_DRIVERS: dict[str, Any] = {
@@ -53,12 +54,11 @@ def parse_env(text: str) -> tuple[str, dict[str, Any]]:
         if module:
             importlib.import_module(module)
         spec = gym.spec(name)
-    except (gym.error.Error, ModuleNotFoundError) as problem:
-        raise ValueError(
-            f"env must be the id of an environment, got {shown(env)}: {problem}"
-        ) from None
-    if "preset" not in spec.kwargs:
-        raise ValueError(f"env must be the id of an environment of dptse_env, got {shown(env)}")
+    except (gym.error.Error, ModuleNotFoundError):
+        spec = None
+    known = ", ".join(ENVIRONMENTS)
+    is_own = spec is not None and "preset" in spec.kwargs
+    require(is_own, "env", f"the id of an environment of this package, as {known}", env)
     keywords = parse_json(rest or "{}", "env")
     require(isinstance(keywords, dict), "env", "an id and a JSON object", rest)
     return env, keywords

@@ -29,11 +29,11 @@ from threading import Lock
 from typing import Any, Literal, TypeVar
 
 import loky
-from tqdm import tqdm
 
 from dptse_env.command_line import TOOLS
 from dptse_env.traffic.recording import follow_parent, uninterrupted
 from dptse_env.utils.kernels import compiling_is_said
+from dptse_env.utils.progress import make_bar
 from dptse_env.utils.registry import needed_for
 from dptse_env.utils.validation import integer
 
@@ -326,7 +326,7 @@ def run_shown(
         ExecutorError: Workers died again and again. Errors of ``work`` are raised as they are.
     """
     waiting, running = iter(enumerate(tasks)), dict[Future[ResultT], int]()
-    with tqdm(total=sum(map(size, tasks)), disable=not progress, **bar) as shown:
+    with make_bar(sum(map(size, tasks)), shown=progress, **bar) as shown:
         try:
             while True:
                 for index, task in islice(waiting, max(executor.ahead - len(running), 0)):

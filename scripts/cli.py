@@ -1,25 +1,30 @@
-"""Shared parts of all commands: arguments, logging, and one line on bad input."""
+"""Shared parts of all commands: their options, logging, and one line on bad input."""
 
 from __future__ import annotations
 
 import contextlib
+import io
+import json
 import logging
 import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby, takewhile
 from pathlib import Path
 from typing import Any
 
 import tyro
+from rich.table import Table
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from agents.environments import parse_env, preset_of, quietly
 from agents.executors import AnyExecutor, ExecutorError, ExecutorName, make_executor
 from agents.play import PlayError, record
 from agents.study import Place
+from agents.terminal import print_table
 from dptse_env.config import resolve
 from dptse_env.traffic import (
     Corridor,
@@ -28,10 +33,40 @@ from dptse_env.traffic import (
     RecordLibrary,
     SumoVersionError,
 )
+from dptse_env.utils import progress
 from dptse_env.utils.files import require_writable
 from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
 from dptse_env.utils.validation import integer
+
+# Options, one name for one thing in all commands. A command has those that it takes among its
+# bases, and gives them defaults of its own.
+
+
+@dataclass(frozen=True)
+class Command:
+    """What every command has."""
+
+    json: bool = False
+    """Print JSON, for a program, in place of text."""
+    quiet: bool = False
+    """Print errors alone, and JSON where it is asked for."""
+
+    def answer(self, found: Any, *parts: str | Table) -> None:
+        """Print the result: as JSON, as texts and tables, or not at all."""
+        if self.json:
+            print(json.dumps(found, indent=2))
+        elif not self.quiet:
+            for part in parts:
+                if isinstance(part, Table):
+                    print_table(part)
+                else:
+                    print(part)
+
+    def remark(self, text: str) -> None:
+        """Print a line on what is going on, beside the result."""
+        if not self.quiet:
+            print(text, file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -52,6 +87,79 @@ class Environment:
         queries = {"bandwidth": 1, "query_spans": [1]} if "corridor" in keywords else {}
         with quietly():
             return resolve(preset_of(env), {**queries, **keywords}).corridor
+
+
+@dataclass(frozen=True)
+class Environments:
+    """Several environments."""
+
+    env: tuple[str, ...] = ()
+    """Environments: each an id, or an id and keywords as JSON, 'ID {"bandwidth": 3}'."""
+
+
+@dataclass(frozen=True)
+class Policies:
+    """Query policies."""
+
+    policies: tuple[str, ...] = ()
+    """Query policies: schedules by name, saved policies by file or shipped name, or
+    "module:Class"."""
+
+
+@dataclass(frozen=True)
+class Estimators:
+    """Estimators."""
+
+    estimators: tuple[str, ...] = ()
+    """State estimators by name, or "module:Class"."""
+
+
+@dataclass(frozen=True)
+class TrainSeeds:
+    """Traffic for training."""
+
+    train_seeds: str | None = None
+    """Traffic seeds to train on, first:stop, of 0 to 999."""
+
+
+@dataclass(frozen=True)
+class ValidationSeeds:
+    """Traffic for choices."""
+
+    validation_seeds: str | None = None
+    """Traffic seeds to choose on, first:stop, of 1000 to 1999."""
+
+
+@dataclass(frozen=True)
+class TestSeeds:
+    """Traffic for results."""
+
+    test_seeds: str | None = None
+    """Traffic seeds that nothing was trained or chosen on, first:stop, from 2000 on."""
+
+
+@dataclass(frozen=True)
+class Seed:
+    """The seed of all that is drawn beside the traffic."""
+
+    seed: int = 0
+    """Seeds what is drawn beside the traffic."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """The place of the results."""
+
+    output: Path = Path("results")
+    """Folder of the results."""
+
+
+@dataclass(frozen=True)
+class Replacing(Output):
+    """The place of results that an earlier run may have left."""
+
+    force: bool = False
+    """Replace the results of an earlier run."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +235,7 @@ def run(
     *,
     program: str | None = None,
     words: Sequence[str] | None = None,
+    renamed: Mapping[str, str] | None = None,
     resumes: bool = True,
 ) -> None:
     """Parse the command line into ``arguments`` and call ``main`` with them.
@@ -142,15 +251,14 @@ def run(
         description: Text for ``--help``: a sentence, and an example in a paragraph of its own.
         program: Name of the program in its help; that of the file if None.
         words: The command line; that of the process if None.
+        renamed: What has the place of options that there were, by their names.
         resumes: Whether the program goes on from what an interrupted run has done.
     """
     logging.basicConfig(format="%(message)s")
-    config = (tyro.conf.FlagCreatePairsOff,)
     try:
-        given = tyro.cli(
-            arguments, prog=program, args=words, description=description, config=config
-        )
+        given = parse(arguments, description, program, words, renamed or {})
         with logging_redirect_tqdm(), warnings_told_once(), interrupted_by_sigterm():
+            progress.set_quiet(getattr(given, "quiet", False))
             if isinstance(given, Recording):
                 given.check()
             main(given)
@@ -163,6 +271,46 @@ def run(
         goes_on = "goes on from what is done" if resumes else "begins anew"
         print(f"\ninterrupted: the same command {goes_on}", file=sys.stderr)
         raise SystemExit(128 + (*interrupt.args, signal.SIGINT)[0]) from None
+
+
+def parse(
+    arguments: Any, description: str | None, program: str | None, words: Sequence[str] | None,
+    renamed: Mapping[str, str],
+) -> Any:  # fmt: skip
+    """Return the arguments that a command line gives; see `run`.
+
+    Raises:
+        ValueError: It cannot be parsed; the message is one line.
+        SystemExit: It asked for help, which is printed.
+    """
+    words = sys.argv[1:] if words is None else words
+    for word in words:
+        option = word.partition("=")[0].replace("_", "-")
+        if option in renamed:
+            raise ValueError(f"{option} is {renamed[option]} now")
+    boxes = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(boxes):
+            return tyro.cli(
+                arguments, prog=program, args=words, description=description,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )  # fmt: skip
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise ValueError(_unboxed(boxes.getvalue())) from None
+
+
+def _unboxed(box: str) -> str:
+    """Return what a box says of an error, in one line, without the help on options in it."""
+    lines = [line.strip("│").removeprefix(" ").rstrip() for line in box.splitlines()]
+    said = []
+    for is_rule, section in groupby(lines, key=lambda line: line[:1] in ("╭", "─", "╰")):
+        first = takewhile(bool, section)  # what follows a blank line are details
+        words = " ".join(line.strip() for line in first if not line.startswith(" " * 8))
+        if not is_rule and not words.startswith(("For full", "Argument helptext")):
+            said.append(words.rstrip("."))
+    return "; ".join(said)
 
 
 @contextlib.contextmanager

@@ -10,23 +10,17 @@ import dptse_env
 
 GROUPS = {
     "try": {
-        "evaluate": "compare schedules and policies on traffic",
+        "evaluate": "compare query policies and estimators on traffic",
         "info": "print versions and caches for a bug report",
     },
     "train": {
         "train": "train a query policy",
         "train-estimator": "train the recurrent network",
-        "tune": "tune the settings of estimators",
-    },
-    "compare": {
-        "suite": "score a policy in the query suite",
-        "replay-field": "compare estimators on a measured field",
     },
     "bring your own": {
-        "import": "import trajectories, a SUMO network or a field",
+        "import": "import trajectories, a SUMO net, a field or a policy",
         "record": "record traffic with SUMO ahead of time",
         "fit": "fit parameters, estimator and rule to a road",
-        "policy": "import a model of stable-baselines3",
     },
     "study": {
         "study": "run a study and write its report",
@@ -35,8 +29,29 @@ GROUPS = {
 }
 """Commands by what a person wants. Each is a module of this folder with ``Args`` and ``main``."""
 
-ANEW = ("audit", "import", "info", "policy", "replay-field")
+ANEW = ("audit", "import", "info")
 """Commands that begin anew after an interruption, as others do with --force."""
+
+GONE = {
+    "suite": "evaluate --suite",
+    "tune": "fit --tune",
+    "policy": "import policy",
+    "replay-field": "import field, and then evaluate",
+}
+"""What has the place of commands that there were."""
+
+RENAMED: dict[str, dict[str, str]] = {
+    "audit": {},
+    "evaluate": {},
+    "fit": {},
+    "import": {},
+    "info": {},
+    "record": {},
+    "study": {},
+    "train": {},
+    "train-estimator": {},
+}
+"""What has the place of options that there were, by command."""
 
 MODULES = {name: f"scripts.{name.replace('-', '_')}" for group in GROUPS.values() for name in group}
 MODULES["import"] = "scripts.import_road"
@@ -44,8 +59,10 @@ MODULES["import"] = "scripts.import_road"
 
 def main(words: Sequence[str]) -> None:
     """Run the command that the first word names; an unknown one ends the program with status 2."""
-    name, rest = (words[0], words[1:]) if words else ("--help", ())
-    if name in ("-h", "--help"):
+    name, rest = (words[0], words[1:]) if words else ("help", ())
+    if name == "help" and rest:
+        name, rest = rest[0], (*rest[1:], "--help")
+    if name in ("-h", "--help", "help"):
         print(overview())
     elif name == "--version":
         print(f"dptse {dptse_env.__version__}")
@@ -55,11 +72,13 @@ def main(words: Sequence[str]) -> None:
         module = importlib.import_module(MODULES[name])
         program, resumes = f"dptse {name}", name not in ANEW and "--force" not in rest
         run(
-            module.main, module.Args, module.__doc__, program=program, words=rest, resumes=resumes
+            module.main, module.Args, module.__doc__, program=program, words=rest,
+            renamed=RENAMED[name], resumes=resumes,
         )  # fmt: skip
     else:
         known = ", ".join(MODULES)
-        print(f"error: there is no command {name!r}, there are {known}", file=sys.stderr)
+        said = f"is dptse {GONE[name]} now" if name in GONE else f"is no command; there are {known}"
+        print(f"error: {name!r} {said}", file=sys.stderr)
         raise SystemExit(2)
 
 
@@ -69,7 +88,7 @@ def overview() -> str:
     for group, commands in GROUPS.items():
         first, *others = (f"{name:<16} {meaning}" for name, meaning in commands.items())
         lines += ["", f"{group:<16}{first}", *(f"{'':<16}{other}" for other in others)]
-    return "\n".join([*lines, "", "dptse COMMAND --help begins with an example that runs."])
+    return "\n".join([*lines, "", "dptse help COMMAND begins with an example that runs."])
 
 
 if __name__ == "__main__":

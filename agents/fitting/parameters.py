@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy import optimize
-from tqdm import tqdm
 
 from agents.files import write_json
 from agents.play import Cell, play
@@ -24,6 +23,7 @@ from dptse_env.model import ARZModel, ARZParameters
 from dptse_env.release import Traffic
 from dptse_env.traffic import Corridor, RecordLibrary
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.progress import make_bar
 from dptse_env.utils.validation import read_json
 
 FIELDS = ("free_flow_speed", "jam_density", "gamma", "relaxation_time")
@@ -138,7 +138,7 @@ def fit_parameters(
     tried: dict[tuple[float, ...], float] = {}
     if kept.exists():
         tried = {tuple(values): error for *values, error in read_json(kept)}
-    shown = tqdm(total=tries, desc="ARZ parameters", unit="try", mininterval=0.5)
+    shown = make_bar(tries, desc="ARZ parameters", unit="try", mininterval=0.5)
 
     def parameters_at(values: FloatArray) -> ARZParameters:
         v_f, jam, gamma, tau = _rounded(np.clip(values, low, high))

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import platformdirs
-from tqdm import tqdm
 
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.imported import load_record, ranges, record_path, require_seeds
@@ -34,6 +33,7 @@ from dptse_env.traffic.recording import record_seeds
 from dptse_env.traffic.sumo import RecordingError, SumoVersionError, sumo_version
 from dptse_env.traffic.sumo_input import NetconvertError
 from dptse_env.utils.files import require_writable
+from dptse_env.utils.progress import make_bar
 from dptse_env.utils.threads import n_cores
 from dptse_env.utils.units import HOUR
 from dptse_env.utils.validation import integer, require
@@ -207,7 +207,7 @@ class RecordLibrary:
             _say_recording(corridor, math.ceil(len(seeds) / workers))
         sources = {seed: _source(corridor, seed) for seed in seeds}
         about = {"desc": f"recording {corridor.name}", "unit": "seed"}
-        with tqdm(total=len(seeds), disable=not progress, **about) as bar:
+        with make_bar(len(seeds), shown=progress, **about) as bar:
             told: dict[int, str] = {}
 
             def remark(seed: int, text: str) -> None:
