@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib
 import warnings
 from collections.abc import Iterator, Mapping
@@ -11,12 +12,17 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode
 
-from dptse_env.config import EnvConfig
+from dptse_env.config import KEYWORDS, PRESETS, EnvConfig
 from dptse_env.env import SensorQueryEnv
 from dptse_env.evaluation import require_in_step
+from dptse_env.privacy import rounded_up
 from dptse_env.registration import ENVIRONMENTS
+from dptse_env.release import RELEASE_MODELS
 from dptse_env.utils.validation import parse_json, require
 from dptse_env.vector_env import SensorQueryVectorEnv
+
+LONGEST = 40
+"""Letters of a value that a heading shows."""
 
 OTHER_DRIVERS: dict[str, Any] = {
     "corridor": {"drivers": {"model": "Krauss"}},
@@ -91,6 +97,58 @@ def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> Senso
     assert isinstance(made, SensorQueryVectorEnv)
     require_in_step(made)
     return made
+
+
+INTERFACE = ("action", "observation", "traffic_seeds", "truth_in_info")
+"""Keywords that say what a policy is shown and how it answers, but change no error."""
+
+
+def heading(env: str, config: EnvConfig) -> str:
+    """Return an environment in words: its id and every condition that is not the id's default.
+
+    Parameters and the release model with its losses are named in any case. The estimator is left
+    to what stands below the heading.
+
+    Args:
+        env: Id of the environment.
+        config: Its configuration.
+    """
+    default, privacy = PRESETS[preset_of(env)], config.privacy
+    losses = f"epsilon {rounded_up(privacy.epsilon)}, delta {rounded_up(privacy.delta)}"
+    said = [
+        env.rpartition("/")[2],
+        f"parameters {config.parameters.name}",
+        f"release model {RELEASE_MODELS.name_of(privacy.preset)} ({losses})",
+    ]
+    road = config.corridor
+    if road.name != default.corridor.name:
+        sensors = ", ".join(map(str, road.fixed_sensors)) or "none"
+        said.insert(1, f"road {road.name} (fixed sensors {sensors})")
+    else:
+        said += _differences("corridor", road.fields(), default.corridor.fields())
+    expected = RELEASE_MODELS.find(privacy.preset).settings_type(
+        preset=privacy.preset, epsilon=privacy.epsilon, delta=privacy.delta
+    )
+    said += _differences("privacy", vars(privacy), vars(expected))
+    for name in KEYWORDS:
+        if name not in ("corridor", "privacy", "parameters", "estimator", *INTERFACE):
+            own, other = getattr(config, name), getattr(default, name)
+            if dataclasses.is_dataclass(own) and type(own) is type(other):
+                said += _differences(name, vars(own), vars(other))
+            else:
+                said += _differences("", {name: own}, {name: other})
+    return ", ".join(said)
+
+
+def _differences(path: str, own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Return the values that differ from others, by path; of long ones the path alone."""
+    found = []
+    for name, value in own.items():
+        if value != other.get(name):
+            words = getattr(value, "__name__", str(value))
+            place = f"{path}.{name}" if path else name
+            found.append(f"{place} {words}" if len(words) <= LONGEST else f"another {place}")
+    return found
 
 
 @contextlib.contextmanager

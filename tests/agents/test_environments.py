@@ -1,0 +1,55 @@
+"""Environments of command lines: their ids, keywords and headings."""
+
+import pytest
+
+from agents.environments import heading, make_config, parse_env, quietly
+from dptse_env.registration import ENVIRONMENTS
+
+PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
+
+
+def headed(text):
+    env, keywords = parse_env(text)
+    with quietly():
+        return heading(env, make_config(env, keywords))
+
+
+def test_the_heading_of_an_id_has_parameters_and_losses_alone():
+    model = "release model paced (epsilon 5, delta 0.05)"
+    assert headed(PRIVATE) == f"PrivateHighway-v1, parameters w99-3lane, {model}"
+
+
+@pytest.mark.parametrize(
+    ("keywords", "named"),
+    [
+        ('{"bandwidth": 1}', "bandwidth 1"),
+        ('{"penetration": 0.3}', "penetration.share 0.3"),
+        ('{"corridor": {"fixed_sensors": [0]}}', "corridor.fixed_sensors (0,)"),
+        ('{"detectors": {"absolute": 2}}', "detectors.absolute 2.0"),
+        ('{"reward": "density"}', "reward density"),
+        ('{"epsilon": 1}', "release model paced (epsilon 1, delta 0.05)"),
+        ('{"privacy": {"preset": "capped", "cap": 16}}', "privacy.cap 16"),
+        ('{"parameters": "published"}', "parameters published"),
+        ('{"horizon": 300}', "horizon 300"),
+        ('{"incident": "none"}', "corridor.incident None"),
+        ('{"demand": {"base": {"mainline": [[0, 900]]}}}', "another corridor.demand"),
+        (
+            '{"corridor": "short-highway", "bandwidth": 2}',
+            "road short-highway (fixed sensors 5, 7)",
+        ),
+    ],
+)
+def test_a_heading_names_what_differs(keywords, named):
+    assert f", {named}" in headed(f"{PRIVATE} {keywords}")
+
+
+@pytest.mark.parametrize("env", ["nope", "CartPole-v1", "nope:dptse/ShortHighway-v0", ""])
+def test_another_id_is_refused_with_those_of_this_package(env):
+    with pytest.raises(ValueError, match="^env must be the id") as refused:
+        parse_env(env)
+    assert all(name in str(refused.value) for name in ENVIRONMENTS)
+
+
+def test_what_follows_an_id_must_be_an_object():
+    with pytest.raises(ValueError, match="^env must be an id and a JSON object"):
+        parse_env(f"{PRIVATE} [1]")
