@@ -18,7 +18,7 @@ GROUPS = {
         "train-estimator": "train the recurrent network",
     },
     "bring your own": {
-        "import": "import trajectories, a SUMO net, a field or a policy",
+        "import": "import trajectories, nets, fields, policies",
         "record": "record traffic with SUMO ahead of time",
         "fit": "fit parameters, estimator and rule to a road",
     },

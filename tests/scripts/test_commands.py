@@ -23,14 +23,15 @@ from dptse_env.traffic import RecordingError
 from dptse_env.utils.registry import EXTRAS
 from dptse_env.versions import code_version
 from scripts import info
-from scripts.dptse import MODULES
+from scripts.dptse import GONE, MODULES, RENAMED
 from tests.helpers import ROOT, SHORT, fast_and_slow, save_untrained
 from tests.importers.data import plain, stream
 from tests.importers.sumo_net.conftest import motorway
 from tests.scripts.commands import refused, run_command
 from tests.scripts.test_policy import save_model
 
-COMMANDS = [*MODULES, "import trajectories", "import network", "import field"]
+KINDS = ["trajectories", "network", "field", "policy"]
+COMMANDS = [*MODULES, *(f"import {kind}" for kind in KINDS)]
 SCREEN = 48
 """Lines of a screen, of 100 columns."""
 
@@ -95,11 +96,66 @@ def test_the_overview_has_every_command_and_fits_a_terminal():
     assert run_command("--version").stdout == f"dptse {dptse_env.__version__}\n"
 
 
-def test_an_unknown_command_or_option_is_told():
+def test_help_on_a_command_is_that_of_the_command():
+    assert run_command("help").stdout == run_command("--help").stdout
+    assert run_command("help", "record").stdout == run_command("record", "--help").stdout
+    words = "import", "field"
+    assert run_command("help", *words).stdout == run_command(*words, "--help").stdout
+    assert "no command" in refused("help", "recrod")
+
+
+def test_an_unknown_command_is_told():
     assert all(name in refused("recrod") for name in ("recrod", *MODULES))
-    done = run_command("record", "--sed", "0:1")
-    assert done.returncode == 2
-    assert "--seeds" in done.stderr
+
+
+@pytest.mark.parametrize("name", GONE)
+def test_what_has_the_place_of_a_command_is_told(name):
+    new = GONE[name]
+    assert new in refused(name, "--help")
+    assert new.split()[0] in MODULES
+
+
+OLD = [(name, old) for name, options in RENAMED.items() for old in options]
+
+
+@pytest.mark.parametrize(("name", "old"), OLD)
+def test_what_has_the_place_of_an_option_is_told(name, old, monkeypatch):
+    new = RENAMED[name][old]
+    assert f"{old} is {new} now" in refused(name, f"{old}=1")
+    kinds = KINDS if name == "import" else [""]
+    pages = "".join(help_of(f"{name} {kind}", monkeypatch) for kind in kinds)
+    offered = re.findall(r"--[a-z-]+", pages)
+    assert old not in offered
+    assert {*re.findall(r"--[a-z-]+", new)} <= {*offered}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["record", "--sed", "0:1"], "Unrecognized options: --sed, 0:1"),
+        (["record", "--workers", "x"], "Error parsing --workers"),
+        (["record", "--workers"], "Missing value for argument '--workers'"),
+        (["train-estimator", "--kinds", "x"], "Expected one of ('flows', 'speeds')"),
+        (["import"], "Expected one of {trajectories"),
+        (["import", "field", "--lanes", "3"], "Missing from dptse import field: --output PATH"),
+        (["study"], "Missing from dptse study"),
+    ],
+)
+def test_a_line_that_cannot_be_parsed_is_an_error_in_one_line(words, said):
+    assert said in refused(*words)
+
+
+def test_every_command_can_be_quiet_and_can_print_json(monkeypatch):
+    for name in COMMANDS:
+        if name != "import":
+            assert {"--json", "--quiet"} <= {*re.findall(r"--[a-z]+", help_of(name, monkeypatch))}
+
+
+def test_a_quiet_command_prints_json_alone():
+    assert run_command("info", "--quiet") == (0, "", "")
+    done = run_command("info", "--quiet", "--json")
+    assert "packages" in json.loads(done.stdout)
+    assert done.stderr == ""
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch, capsys):
