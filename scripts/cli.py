@@ -258,7 +258,9 @@ def run(
     try:
         given = parse(arguments, description, program, words, renamed or {})
         with logging_redirect_tqdm(), warnings_told_once(), interrupted_by_sigterm():
-            progress.set_quiet(getattr(given, "quiet", False))
+            is_quiet = getattr(given, "quiet", False)
+            progress.set_quiet(is_quiet)
+            logging.getLogger().setLevel(logging.ERROR if is_quiet else logging.WARNING)
             if isinstance(given, Recording):
                 given.check()
             main(given)

@@ -10,7 +10,7 @@ import dptse_env
 
 GROUPS = {
     "try": {
-        "evaluate": "compare query policies and estimators on traffic",
+        "evaluate": "compare policies and estimators on traffic",
         "info": "print versions and caches for a bug report",
     },
     "train": {
