@@ -30,7 +30,7 @@ from typing import Any, Literal, TypeVar
 
 import loky
 
-from dptse_env.command_line import TOOLS
+from dptse_env.tools import add_tools_path
 from dptse_env.traffic.recording import follow_parent, uninterrupted
 from dptse_env.utils.kernels import compiling_is_said
 from dptse_env.utils.progress import make_bar
@@ -221,9 +221,10 @@ class RayCluster(Executor):
     def _connect(self, address: str | None) -> None:
         if address is not None and address != "auto":
             _require_cluster(address)
-        environment: dict[str, Any] = {"env_vars": {"OMP_NUM_THREADS": "1"}}
-        if TOOLS.is_dir():
-            environment["worker_process_setup_hook"] = "dptse_env.command_line.add_tools_path"
+        environment = {
+            "env_vars": {"OMP_NUM_THREADS": "1"},
+            "worker_process_setup_hook": f"{add_tools_path.__module__}.{add_tools_path.__name__}",
+        }
         try:
             self._ray.init(
                 address=address or "local",

@@ -1,9 +1,4 @@
-"""``dptse``: the package's tools as commands, with or without a checkout.
-
-The tools live in the top-level packages ``agents`` and ``scripts`` of the repository. A wheel has
-them in a folder of this package, so that an installation adds no packages of these names; the
-folder is put on the path when a tool runs.
-"""
+"""``dptse``: the package's tools as commands, with or without a checkout."""
 
 import importlib
 import io
@@ -11,16 +6,8 @@ import os
 import sys
 from pathlib import Path
 
+from dptse_env.tools import add_tools_path
 from dptse_env.utils.registry import MissingExtraError, needed_for
-
-TOOLS = Path(__file__).parent / "_tools"
-"""Folder of the tools in a wheel; an editable installation has them beside this package."""
-
-
-def add_tools_path() -> None:
-    """Make the tools importable in this process; worker processes inherit the path, or call it."""
-    if TOOLS.is_dir() and str(TOOLS) not in sys.path:
-        sys.path.insert(0, str(TOOLS))
 
 
 def main() -> None:

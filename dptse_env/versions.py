@@ -10,6 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from dptse_env.tools import TOOLS
+
 __version__ = "0.3.0.dev0"
 
 PACKAGE = Path(__file__).parent
@@ -18,8 +20,8 @@ KINDS = (".json", ".py", ".safetensors", ".xml")
 """Endings of the files that move numbers: code, settings, weights and SUMO nets."""
 
 LEFT_OUT = (
-    "__init__.py", "versions.py", "command_line.py", "rendering.py", "importers/*", "_tools/*",
-    "policies/*.safetensors",
+    "__init__.py", "versions.py", "command_line.py", "tools.py", "rendering.py", "importers/*",
+    "_tools/*", "policies/*.safetensors",
 )  # fmt: skip
 """Files of these kinds that move none. Results name a policy by a digest of its own."""
 
@@ -81,9 +83,7 @@ def equal_digests() -> Mapping[str, str]:
 @cache
 def digest() -> str:
     """Return 12 digits of the digest of this code, the same in a wheel and in a checkout."""
-    from dptse_env.command_line import TOOLS  # noqa: PLC0415 (slow to import)
-
-    return digest_of(PACKAGE, TOOLS if TOOLS.is_dir() else PACKAGE.parent)
+    return digest_of(PACKAGE, TOOLS)
 
 
 def digest_of(package: Path, tools: Path) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 import gymnasium as gym
 
 import dptse_env
-from dptse_env.command_line import add_tools_path
+from dptse_env.tools import add_tools_path
 from dptse_env.utils.registry import MissingExtraError
 
 SHORT = ["--env", "dptse_env:dptse/ShortHighway-v0"]
