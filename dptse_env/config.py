@@ -446,10 +446,14 @@ def _seeds(path: str, value: Any, base: Any, corridor: Corridor) -> tuple[int, .
 
 
 def _recorded_seeds(base: tuple[int, ...], corridor: Corridor) -> tuple[int, ...]:
-    """Return the preset's traffic seeds, or all of training that were recorded on the road."""
+    """Return the preset's traffic seeds, or those of training that were recorded on the road.
+
+    Where none of these was, they are all that there are.
+    """
     if corridor.recordings is None:
         return base
-    return tuple(seed for seed in recorded_seeds(corridor.recordings) if seed in TRAINING_SEEDS)
+    recorded = recorded_seeds(corridor.recordings)
+    return tuple(seed for seed in recorded if seed in TRAINING_SEEDS) or recorded
 
 
 def parse_seeds(text: str, path: str = "seeds") -> tuple[int, ...]:

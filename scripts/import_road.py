@@ -281,9 +281,10 @@ def print_next(
     if missing:
         most = corridor.conditions.duration
         print(
-            f"note: there is no window for {' and '.join(missing)}, which fitting and evaluating "
-            f"need: a duration below {most} s, more files or other shares make some"
+            f"note: there is no window for {' and '.join(missing)}, which fitting needs: a "
+            f"duration below {most} s, more files or other shares make some"
         )
+    if not seeds["test"]:
         return
     given = {
         "bandwidth": min(2, corridor.geometry.n_mainline),
@@ -293,7 +294,7 @@ def print_next(
     first, last = seeds["test"][0], seeds["test"][-1]
     fit = "fit", road.as_posix(), *(("--env", fit_for) if fit_for else ())
     evaluate = "evaluate", "--env", f"{env} {json.dumps(given)}", "--seeds", f"{first}:{last + 1}"
-    for words in (fit, evaluate):
+    for words in (evaluate,) if missing else (fit, evaluate):
         print(f"next: {shlex.join(('dptse', *words))}")
 
 

@@ -483,7 +483,7 @@ def import_field(
     Cells are averaged over segments, density and flow alike, and intervals are interpolated to
     seconds. The field is cut into windows of `duration` seconds, that many and the second 0, which
     do not overlap: each is the record of a traffic seed, the first windows those of the first
-    split. The demand of the written road is the mean flow of the first split.
+    split. The demand of the written road is the mean flow of the first split that has windows.
 
     Args:
         source: The files.
@@ -516,10 +516,10 @@ def import_field(
     records = [
         Record(n_steps=duration + 1, n_columns=len(order), field=window) for window in windows
     ]
-    n_training = len(seeds[splits[0].name])
-    entering = np.mean([window[:, 0].prod(axis=-1).mean() for window in windows[:n_training]])
+    n_first = len(next(filter(None, seeds.values())))
+    entering = np.mean([window[:, 0].prod(axis=-1).mean() for window in windows[:n_first]])
     demand = Demand(mainline=((0.0, round(float(entering), 1)),))
-    measured = with_measured(bare, records[:n_training], demand)
+    measured = with_measured(bare, records[:n_first], demand)
     sources: list[dict[str, Any]] = [
         {"seed": seed, "file": source.density.name, "start": start}
         for seed, start in zip(flat, starts, strict=True)
@@ -527,7 +527,7 @@ def import_field(
     with new_folder(output) as folder:
         kept = save_records(folder, bare, records, sources, "fields")
         written = measured.replaced(recordings=kept)
-        comment = "A measured field. Demand and average dwell are those of its training windows."
+        comment = "A measured field. Demand and average dwell are those of its first windows."
         write_corridor(folder / ROAD, written, comment=comment)
     return moved(written, output), seeds
 

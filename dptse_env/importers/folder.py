@@ -78,7 +78,7 @@ def import_trajectories(
     Each file is cut into windows of `corridor.duration` seconds (that many, and the second 0),
     which do not overlap. Windows are in the order of the files and of time; the first are those of
     the first split. Demand, exit shares and average dwell of the written road are measured in the
-    windows of the first split; its incident is dropped.
+    windows of the first split that has any; its incident is dropped.
 
     Args:
         files: The files, in order of time.
@@ -143,12 +143,12 @@ def import_trajectories(
         notes += _overlaps(sources, corridor.conditions.duration)
 
         # One at a time, so that one is in memory.
-        training = seeds[splits[0].name]
-        road = measure(recorded, lambda: (load_record(recorded, seed) for seed in training))
+        first = next(filter(None, seeds.values()))
+        road = measure(recorded, lambda: (load_record(recorded, seed) for seed in first))
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
         write_corridor(folder / ROAD, road, environment, comment)
-        first = load_record(recorded, flat[0])
-        report = write_report(folder, road, recordings, seeds, sources, first, notes)
+        drawn = load_record(recorded, flat[0])
+        report = write_report(folder, road, recordings, seeds, sources, drawn, notes)
     return Imported(moved(road, output), seeds, report)
 
 
@@ -175,8 +175,8 @@ def _overlaps(windows: Iterable[Mapping[str, Any]], duration: float) -> list[str
 def check_splits(splits: Sequence[Split]) -> None:
     """Raise ``ValueError`` unless the shares add up."""
     shares = [split.share for split in splits]
-    fits = min(shares) >= 0.0 and shares[0] > 0.0 and abs(sum(shares) - 1.0) < 1e-9
-    require(fits, "shares", "at least 0, the first above 0, with the sum 1", shares)
+    fits = min(shares) >= 0.0 and abs(sum(shares) - 1.0) < 1e-9
+    require(fits, "shares", "at least 0, with the sum 1", shares)
 
 
 def assign_seeds(splits: Sequence[Split], n_windows: int) -> dict[str, tuple[int, ...]]:

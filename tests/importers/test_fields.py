@@ -86,6 +86,18 @@ def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
             gym.make("dptse_env:dptse/PaperHighway-v0", corridor=path, bandwidth=2, privacy=preset)
 
 
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+def test_all_windows_may_be_for_tests(tmp_path):
+    shares = [each._replace(share=float(each.name == "test")) for each in SPLITS]
+    road, seeds = import_field(write(tmp_path), ROAD, tmp_path / "road", shares, 100)
+    assert seeds == {"training": (), "validation": (), "test": (2000, 2001, 2002, 2003)}
+    fields = [RecordLibrary(tmp_path).get(road, seed).field for seed in seeds["test"]]
+    flow = np.mean([field[:, 0].prod(axis=-1) for field in fields])
+    assert road.conditions.demand.mainline[0][1] == pytest.approx(flow, rel=1e-3)
+    env = gym.make("dptse_env:dptse/PaperHighway-v0", corridor=road, bandwidth=2)
+    assert env.unwrapped.config.traffic_seeds == seeds["test"]
+
+
 @pytest.mark.parametrize(
     ("changes", "road", "duration", "message"),
     [

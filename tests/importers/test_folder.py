@@ -30,6 +30,14 @@ def test_every_split_has_a_window_if_it_can():
     assert assign_seeds(splits, 1) == {"training": (0,), "validation": (), "test": ()}
 
 
+def test_a_road_is_measured_on_the_first_windows_that_there_are(tmp_path):
+    path = plain(tmp_path / "a.csv", stream())
+    tests = [split._replace(share=float(split.name == "test")) for split in SPLITS]
+    imported = run(path, splits=tests)
+    assert [len(each) for each in imported.seeds.values()] == [0, 0, 5]
+    assert imported.corridor.measured == ("demand", "exit_shares", "average_dwell")
+
+
 def test_other_errors_name_the_option(tmp_path):
     path = plain(tmp_path / "a.csv", stream())
     lanes = Strip(lanes=(1,))

@@ -190,22 +190,31 @@ def test_the_page_on_own_data_goes_on_to_a_policy(fifteen_minutes, monkeypatch):
     assert "1 episode on test traffic" in done.stdout
 
 
-@pytest.mark.parametrize("duration", [90, 200])
-def test_a_field_says_what_comes_next_or_what_is_missing_for_it(duration, tmp_path):
+@pytest.mark.parametrize(
+    ("more", "missing", "next_ones"),
+    [
+        (("--duration", "90"), None, ["fit", "evaluate"]),
+        (("--duration", "200"), "validation and test", []),
+        (("--duration", "90", "--shares", "0", "0", "1"), "training and validation", ["evaluate"]),
+    ],
+)
+def test_a_field_says_what_comes_next_or_what_is_missing_for_it(more, missing, next_ones, tmp_path):
     field = source(tmp_path, columns=60)
     printed = run(
         "field", "--density", field.density, "--speed", field.speed, "--cell", "0.05",
         "--interval", "5", "--density-unit", "veh/ft", "--speed-unit", "ft/s", "--name", "mine",
-        "--segments", "3", "--lanes", "5", "--speed-limit", "50", "--duration", duration,
+        "--segments", "3", "--lanes", "5", "--speed-limit", "50", *more,
         "--output", tmp_path / "new",
     )  # fmt: skip
     road = (tmp_path / "new" / "road.toml").as_posix()
-    if duration == 200:
-        assert "note: there is no window for validation and test" in printed
-        return
-    fit, evaluate = re.findall(r"^next: dptse (.*)$", printed, re.MULTILINE)
-    assert shlex.split(fit) == ["fit", road, "--env", f'{PAPER} {{"privacy": "corrected"}}']
-    assert shlex.split(evaluate)[-1] == "2000:2001"
+    told = f"note: there is no window for {missing}"
+    assert (told in printed) == (missing is not None)
+    lines = [shlex.split(line) for line in re.findall(r"^next: dptse (.*)$", printed, re.MULTILINE)]
+    assert [words[0] for words in lines] == next_ones
+    if "fit" in next_ones:
+        assert lines[0][1:] == [road, "--env", f'{PAPER} {{"privacy": "corrected"}}']
+    if next_ones:
+        assert lines[-1][-1] == ("2000:2003" if missing else "2000:2001")
 
 
 @pytest.fixture(scope="module")
