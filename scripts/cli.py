@@ -135,7 +135,7 @@ class TestSeeds:
     """Traffic for results."""
 
     test_seeds: str | None = None
-    """Traffic seeds that nothing was trained or chosen on, first:stop, from 2000 on."""
+    """Traffic seeds that nothing was trained or chosen on, first:stop, of 2000 to 2999."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ dptse info
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import os
 import platform
 import sys
@@ -16,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import dptse_env
-from dptse_env.privacy import DELTAS, over_trips, rounded_up
 from dptse_env.traffic import RecordLibrary
 from dptse_env.traffic.library import CACHE_VARIABLE
 from dptse_env.utils.kernels import default_folder
 from dptse_env.utils.threads import n_cores
 from dptse_env.versions import code_version
+from scripts.cli import Command
 
 PACKAGES = (
     "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "mpmath",
@@ -34,14 +33,9 @@ VARIABLES = (CACHE_VARIABLE, "NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT", "OMP_NUM_TH
 """Environment variables that change what the package does."""
 
 
-@dataclass(frozen=True)
-class Args:
+@dataclass(frozen=True, kw_only=True)
+class Args(Command):
     """Print versions, machine and caches."""
-
-    mu: float | None = None
-    """Print, in place of them, what trips of one vehicle reveal together, each of this mu."""
-    json: bool = False
-    """Print JSON, for a program."""
 
 
 def collect() -> dict[str, Any]:
@@ -76,31 +70,19 @@ def installed(package: str) -> str | None:
 
 def main(args: Args) -> None:
     """Print."""
-    found: dict[Any, Any] = collect() if args.mu is None else over_trips(args.mu)
-    if args.json:
-        print(json.dumps(found, indent=2))
-        return
-    if args.mu is not None:
-        _print_trips(found)
-        return
+    found = collect()
     packages = found["packages"]
     lacking = [name for name, version in packages.items() if version is None]
-    print(f"dptse-env {found['dptse-env']} in {found['folder']}")
-    print(f"Python {found['python']}, {found['platform']}, {found['cores']} cores")
-    for text in (
-        ", ".join(f"{name}=={version}" for name, version in packages.items() if version),
-        f"not installed: {', '.join(lacking) or 'none'}",
-    ):
-        print(textwrap.fill(text, 79, break_on_hyphens=False))
-    for cache in ("records", "kernels"):
-        has = found[cache]
-        print(f"{cache}: {has['files']} files, {has['megabytes']} MB in {has['folder']}")
-    for name, value in found["variables"].items():
-        print(f"{name}={value}")
-
-
-def _print_trips(account: dict[int, dict[str, float]]) -> None:
-    print(f"trips       mu  epsilon at delta = {'      '.join(DELTAS)}")  # all rounded up
-    for trips, row in account.items():
-        epsilons = "".join(rounded_up(row[delta], "10.1f") for delta in DELTAS)
-        print(f"{trips:5} {rounded_up(row['mu'], '8.3f')}{'':15}{epsilons}")
+    there = ", ".join(f"{name}=={version}" for name, version in packages.items() if version)
+    lists = there, f"not installed: {', '.join(lacking) or 'none'}"
+    args.answer(
+        found,
+        f"dptse-env {found['dptse-env']} in {found['folder']}",
+        f"Python {found['python']}, {found['platform']}, {found['cores']} cores",
+        *(textwrap.fill(text, 79, break_on_hyphens=False) for text in lists),
+        *(
+            "{}: {files} files, {megabytes} MB in {folder}".format(cache, **found[cache])
+            for cache in ("records", "kernels")
+        ),
+        *(f"{name}={value}" for name, value in found["variables"].items()),
+    )

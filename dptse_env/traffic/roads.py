@@ -1,7 +1,7 @@
 """Roads by name, and roads as TOML files.
 
 The corridors that come with the package have an `average_dwell` measured on the training seeds
-0..15, by ``dptse record --env ID --seeds 0:16``; a test repeats the measurement.
+0..15, by ``dptse record --env ID --train-seeds 0:16``; a test repeats the measurement.
 
 A road file is a corridor, and the keywords of an environment that suit it. It has the fields of a
 `Corridor` and of its parts, with tables for ``demand``, ``incident``, ``drivers`` and

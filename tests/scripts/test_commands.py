@@ -18,7 +18,6 @@ pytest.importorskip("tyro")
 
 import dptse_env
 from dptse_env import command_line
-from dptse_env.privacy import DELTAS
 from dptse_env.traffic import RecordingError
 from dptse_env.utils.registry import EXTRAS
 from dptse_env.versions import code_version
@@ -201,17 +200,6 @@ def test_a_pipe_may_be_closed_as_by_head():
     assert ended.returncode == 141
 
 
-def test_information_on_trips_is_a_row_for_each_number_of_them():
-    header, *rows = [
-        row.split() for row in run_command("info", "--mu", "2.118").stdout.splitlines()
-    ]
-    assert rows[2] == ["10", "6.698", "37.2", "42.4", "46.6", "50.3", "53.6"]
-    assert header[-len(rows[2]) + 2 :] == list(DELTAS)
-    found = json.loads(run_command("info", "--mu", "2.118", "--json").stdout)
-    assert list(found) == [row[0] for row in rows] == ["1", "2", "10", "50", "250"]
-    assert run_command("info", "--mu", "0").returncode == 2
-
-
 def test_information_has_what_a_bug_report_needs():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = [project["optional-dependencies"][name] for name in EXTRAS]
@@ -255,10 +243,10 @@ def test_a_mistake_of_the_program_keeps_its_traceback(monkeypatch):
 
 
 def test_a_program_of_its_own_ends_with_the_status():
-    words = [sys.executable, "-m", "scripts.dptse", "record", "--seeds", "3:1"]
+    words = [sys.executable, "-m", "scripts.dptse", "record", "--train-seeds", "3:1"]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: seeds")
+    assert done.stderr.startswith("error: train_seeds")
 
 
 ENVIRONMENTS = {

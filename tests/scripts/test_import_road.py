@@ -56,8 +56,8 @@ def test_trajectories_become_a_road_that_the_other_commands_take(road, tmp_path)
     }  # fmt: skip
     # What the road file says of an environment stays.
     assert re.search(r"\[environment\]\s+bandwidth = 2", new.read_text())
-    assert "T_avg" in run_command("record", "--env", on(new), "--seeds", "0:4").stdout
-    assert "seed" in refused("record", "--env", on(new), "--seeds", "0:16")
+    assert "T_avg" in run_command("record", "--env", on(new), "--train-seeds", "0:4").stdout
+    assert "seed" in refused("record", "--env", on(new), "--train-seeds", "0:16")
     # A folder of records is never replaced.
     assert "output" in refused("import", *words, "--format", "table", "--columns", *columns)
     assert new.is_file()

@@ -33,7 +33,7 @@ COMMANDS = {
     "study": (["examples.my_study:STUDY", *ONE], "tables.md"),
     "fit": (["road.toml", *ONE], "page.html"),
     "audit": (["--env", SHORT, *ONE], "printed-worst-case-hunter.json"),
-    "record": (["--env", SHORT], None),
+    "record": (["--env", SHORT, "--train-seeds", "0"], None),
     "import trajectories": (
         ["--files", "points.csv", "--format", "table", "--env", on("road.toml"), "--columns",
          "time=t", "vehicle=id", "x=s", "speed=v"], "",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary, randomised
 from tests.helpers import SHORT
-from tests.scripts.commands import run_command
+from tests.scripts.commands import refused, run_command
 
 
 def test_what_an_environment_replays_is_recorded(tmp_path):
@@ -16,7 +16,7 @@ def test_what_an_environment_replays_is_recorded(tmp_path):
         (' {"demand": "random", "incident": "random"}', randomised(SHORT_HIGHWAY), (0,)),
         (' {"corridor": {"duration": 60, "incident": null}}', calm, (1,)),
     ):
-        words = "--env", SHORT + keywords, "--seeds", f"{seeds[0]}:{seeds[-1] + 1}"
+        words = "--env", SHORT + keywords, "--train-seeds", f"{seeds[0]}:{seeds[-1] + 1}"
         done = run_command("record", *words, "--workers", "1", "--records", tmp_path)
         assert done.returncode == 0, done.stderr
         assert f"short-highway: {len(seeds)} record(s) in {tmp_path}" in done.stdout
@@ -25,9 +25,20 @@ def test_what_an_environment_replays_is_recorded(tmp_path):
 
 
 def test_records_for_programs(tmp_path):
-    words = "--env", SHORT, "--records", tmp_path, "--seeds", "0:2", "--workers", "1"
+    seeds = "--train-seeds", "0:2", "--test-seeds", "2000"
+    words = "--env", SHORT, "--records", tmp_path, *seeds, "--workers", "1"
     found = json.loads(run_command("record", *words, "--json").stdout)
-    assert found["seeds"] == [0, 1]
+    assert found["seeds"] == [0, 1, 2000]
     names = sorted(path.name for path in Path(found["folder"]).glob("0*"))
-    assert names == ["00000000.safetensors", "00000001.safetensors"]
+    assert names == [f"0000{seed}.safetensors" for seed in ("0000", "0001", "2000")]
     assert found["dwell"] > 0.0
+
+
+def test_seeds_are_those_of_their_traffic_and_must_be_given(tmp_path):
+    words = "record", "--env", SHORT, "--records", tmp_path / "cache"
+    for option in ("--train-seeds", "--validation-seeds", "--test-seeds"):
+        assert option in refused(*words)
+        assert option in refused(*words, "--seeds", "0:4")
+    outside = refused(*words, "--train-seeds", "0:2", "--validation-seeds", "0:4")
+    assert outside == "error: validation_seeds must be traffic seeds in 1000..1999, got 0"
+    assert not list(tmp_path.iterdir())

@@ -23,7 +23,7 @@ WITHOUT_EXTRAS = {
 }
 WITH_TRAIN = {
     "corridors": [
-        ["record", "--env", f"{SHORT[1]} {json.dumps({'corridor': LONGER})}", "--seeds", "0:1"],
+        ["record", "--env", f"{SHORT[1]} {json.dumps({'corridor': LONGER})}", "--train-seeds", "0"],
     ],
     "ray": [
         ["suite", "static", "--executor", "ray"],

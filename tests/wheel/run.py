@@ -26,7 +26,7 @@ BRIEFLY = 'dptse_env:dptse/ShortHighway-v0 {"horizon": 64}'
 COMMANDS = [
     ["--version"],
     ["info"],
-    ["record", *SHORT, "--seeds", "0:2", "--json"],
+    ["record", *SHORT, "--train-seeds", "0:2", "--json"],
     [
         "train", "--env", BRIEFLY, "--traffic", "0:2",
         "--validation", "1000:1002", "--output", "trained", "--algorithm",
