@@ -25,7 +25,7 @@ DEMO = --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}'
 
 demo: setup  ## Train a query policy for a minute and compare it with rules on other traffic; results/demo.
 	$(BIN)/dptse train $(DEMO) --minutes 1 --algorithm 'ppo {"validations": 8}' \
-		--traffic 0:48 --validation 1000:1016 --output results/demo/training
+		--train-seeds 0:48 --validation-seeds 1000:1016 --output results/demo/training
 	$(BIN)/dptse evaluate $(DEMO) --policies results/demo/training/best.safetensors \
 		--schedules random round-robin oldest-first stale-variance largest-density-variance speed-front \
 		--seeds 2000:2032 --reference speed-front --output results/demo --force

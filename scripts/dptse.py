@@ -48,8 +48,17 @@ RENAMED: dict[str, dict[str, str]] = {
     "info": {"--mu": "dptse_env.privacy.over_trips, a function,"},
     "record": {"--seeds": "--train-seeds, --validation-seeds or --test-seeds"},
     "study": {},
-    "train": {},
-    "train-estimator": {},
+    "train": {
+        "--seeds": "--seed",
+        "--traffic": "--train-seeds",
+        "--validation": "--validation-seeds",
+        "--keywords": "part of --env, 'ID {JSON}'",
+    },
+    "train-estimator": {
+        "--seeds": "--seed",
+        "--traffic": "--train-seeds",
+        "--validation": "--validation-seeds",
+    },
 }
 """What has the place of options that there were, by command."""
 

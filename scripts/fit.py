@@ -308,7 +308,8 @@ def commands(args: Args, choice: Choice, folder: Path) -> list[tuple[str, str]]:
         (
             "Train a query policy, some minutes:",
             f"dptse train {start} --steps 300000 "
-            f"--traffic {seeds['training']} --validation {seeds['validation']} --output {policy}",
+            f"--train-seeds {seeds['training']} --validation-seeds {seeds['validation']} "
+            f"--output {policy}",
         ),
         (
             "Compare it with the rules:",

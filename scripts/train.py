@@ -1,7 +1,7 @@
 r"""Train a query policy in a folder, and go on there after an interruption.
 
-dptse train --env dptse_env:dptse/ShortHighway-v0 --keywords '{"bandwidth": 1}' \
-    --steps 40000 --traffic 0:8 --validation 1000:1004
+dptse train --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}' \
+    --steps 40000 --train-seeds 0:8 --validation-seeds 1000:1004
 
 It writes best.safetensors and policy.safetensors (the policy best in validation, and the last),
 progress.csv and curve.png (the learning curve, beside rules), plan.json (the settings) and
@@ -12,7 +12,6 @@ rounds comes to the same numbers.
 from __future__ import annotations
 
 import contextlib
-import json
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from agents.environments import make_config, parse_env
 from agents.training.run import BEST, RULES_FILE, least
@@ -28,40 +26,36 @@ from agents.training.run_files import Row, check_plan, read_progress
 from agents.training.settings import PlackettLuceSettings, TrainingPlan, parse_algorithm
 from agents.training.training import train, train_all
 from dptse_env.config import parse_seeds
-from dptse_env.utils.validation import integer, parse_json, read_json, require
-from scripts.cli import Machines
+from dptse_env.utils.progress import make_bar
+from dptse_env.utils.validation import integer, read_json
+from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, ValidationSeeds
 
 MINUTES = 10.0
 """Time of a training where nothing else is given, but for plackett-luce."""
 
 
-@dataclass(frozen=True)
-class Args(Machines):
+@dataclass(frozen=True, kw_only=True)
+class Args(Output, Machines, ValidationSeeds, TrainSeeds, Environments, Command):
     """Train a query policy."""
 
     env: tuple[str, ...] = ("dptse_env:dptse/PrivateHighway-v1",)
-    """Environments, each an id or 'id {JSON}' with keywords; plackett-luce takes several."""
-    keywords: str = "{}"
-    """Keywords of all environments as JSON, beside their own."""
+    """Environments, each an id or 'ID {JSON}' with keywords; plackett-luce takes several."""
     algorithm: str = "ppo"
-    """ppo, maskable-ppo, recurrent-ppo, dqn, qr-dqn or plackett-luce, or 'name {JSON}' with
-    settings that differ, such as 'ppo {"policy": "mlp"}'."""
+    """ppo, maskable-ppo, recurrent-ppo, dqn, qr-dqn or plackett-luce, or 'NAME {JSON}' with
+    settings that differ."""
     minutes: float | None = None
     """Time of the processor to train for, 10 by default; plackett-luce has a number of rounds."""
     steps: int | None = None
     """Seconds of traffic to train for, all episodes together, in place of minutes."""
     initial: str | None = None
     """Saved policy for ppo to begin with, such as one by plackett-luce."""
-    seeds: str = "0"
+    seed: str = "0"
     """Training seed, or first:stop for several, each in a folder of its own in the output."""
-    traffic: str = "0:256"
-    """Traffic seeds to train on, first:stop, of 0 to 999."""
-    validation: str = "1000:1024"
-    """Traffic seeds to validate on, first:stop, of 1000 to 1999."""
+    train_seeds: str = "0:256"
+    validation_seeds: str = "1000:1024"
     threads: int = 1
     """Threads of torch; numbers depend on it in the last digits."""
     output: Path = Path("results/training")
-    """Folder of the training."""
 
 
 def make_plans(args: Args) -> dict[Path, TrainingPlan]:
@@ -71,20 +65,19 @@ def make_plans(args: Args) -> dict[Path, TrainingPlan]:
         FileNotFoundError: There is no such policy to begin with.
         ValueError: An argument is out of range.
     """
-    seeds, more = parse_seeds(args.seeds), parse_json(args.keywords, "keywords")
-    require(isinstance(more, dict), "keywords", "a JSON object", args.keywords)
-    envs = [(env, {**more, **own}) for env, own in map(parse_env, args.env)]
-    n_segments = make_config(*envs[0]).corridor.geometry.n_mainline if envs else 0
-    algorithm, minutes = parse_algorithm(args.algorithm, n_segments), args.minutes
+    seeds, minutes = parse_seeds(args.seed, "seed"), args.minutes
+    roads = [make_config(*parse_env(env)).corridor for env in args.env[:1]]
+    n_segments = roads[0].geometry.n_mainline if roads else 0
+    algorithm = parse_algorithm(args.algorithm, n_segments)
     if minutes is None and args.steps is None and not isinstance(algorithm, PlackettLuceSettings):
         minutes = MINUTES
     return {
         args.output if len(seeds) == 1 else args.output / str(seed): TrainingPlan(
-            tuple(f"{env} {json.dumps(keywords)}" if keywords else env for env, keywords in envs),
+            args.env,
             algorithm,
             seed,
-            parse_seeds(args.traffic, "traffic"),
-            parse_seeds(args.validation, "validation"),
+            parse_seeds(args.train_seeds, "train_seeds"),
+            parse_seeds(args.validation_seeds, "validation_seeds"),
             minutes,
             args.steps,
             args.initial,
@@ -104,17 +97,19 @@ def main(args: Args) -> None:
     executor = args.start_executor()
     for world in plan.worlds:
         args.library(world.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
-    if len(plans) > 1:
+    if len(plans) > 1 or args.executor != "local":
         train_all(plans, executor, records=args.records, threads=args.threads)
     else:
         with shown(args.output) as reporters:
             train(plan, args.output, records=args.records, **reporters)
-    for folder in plans:
-        print(f"{folder / BEST}: {summary(read_progress(folder), best_rule(folder))}")
+    found: dict[str, Any] = {"trainings": [result(folder) for folder in plans]}
+    lines = [in_words(**each) for each in found["trainings"]]
     if len(plan.envs) == 1:
         policies = [str(folder / BEST) for folder in plans]
         words = ["dptse", "evaluate", "--env", plan.envs[0], "--policies", *policies]
-        print(f"compare with rules on unseen traffic: {shlex.join(words)}")
+        found["next"] = shlex.join(words)
+        lines.append(f"compare with rules on unseen traffic: {found['next']}")
+    args.answer(found, *lines)
 
 
 @contextlib.contextmanager
@@ -124,12 +119,8 @@ def shown(folder: Path) -> Iterator[dict[str, Any]]:
     Yields the arguments of `train` by which it is told.
     """
     errors: dict[str, str] = {}
-    with tqdm(
-        total=100,
-        desc="training",
-        unit="%",
-        bar_format="{l_bar}{bar}| {elapsed}<{remaining}{postfix}",
-    ) as bar:
+    look = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
+    with make_bar(100, desc="training", unit="%", bar_format=look) as bar:
 
         def add(row: Row) -> None:
             rule, error = best_rule(folder)
@@ -151,11 +142,17 @@ def best_rule(folder: Path) -> tuple[str, float]:
     return min(rules.items(), key=lambda each: each[1])
 
 
-def summary(rows: list[Row], best: tuple[str, float]) -> str:
-    """Return the least error in validation of a learning curve, beside that of a rule, in words."""
-    error, (rule, other) = min(map(least, rows)), best
-    share = 100.0 * (1.0 - error / other)
+def result(folder: Path) -> dict[str, Any]:
+    """Return the best policy of a training, its error in validation, and the best rule's."""
+    rule, error = best_rule(folder)
+    own = min(map(least, read_progress(folder)))
+    return {"policy": str(folder / BEST), "error": own, "best_rule": rule, "rule_error": error}
+
+
+def in_words(policy: str, error: float, best_rule: str, rule_error: float) -> str:
+    """Return a `result` as a line of text."""
+    share = 100.0 * (1.0 - error / rule_error)
     return (
-        f"error x 1000 in validation {1000 * error:.1f}, {abs(share):.1f} % "
-        f"{'below' if share >= 0 else 'above'} the best rule, {rule} ({1000 * other:.1f})"
+        f"{policy}: error x 1000 in validation {1000 * error:.1f}, {abs(share):.1f} % "
+        f"{'below' if share >= 0 else 'above'} the best rule, {best_rule} ({1000 * rule_error:.1f})"
     )

@@ -1,8 +1,7 @@
 r"""Train recurrent networks as an estimator, for releases of flows and of speeds.
 
-dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --seeds 0:1 \
-    --rounds own:2:4 own:2:4 --traffic 0:2 --validation 1000:1001 \
-    --output results/weights \
+dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --seed 0 \
+    --rounds own:2:4 own:2:4 --train-seeds 0:2 --validation-seeds 1000:1001 \
     --plan '{"windows": 2, "ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}'
 
 Each kind and seed is a training in a folder of its own. The best weights of each kind on validation
@@ -25,22 +24,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from agents.environments import make_config, parse_env, quietly
 from agents.executors import THIS_PROCESS, AnyExecutor, run_shown
 from agents.filters.highways import draw_highway
-from agents.filters.plan import FilterPlan, Round
+from agents.filters.plan import FilterPlan, Round, played_by
 from agents.filters.scenarios import Kind, ScenarioRanges
 from agents.filters.training import WEIGHTS, FilterTraining
 from agents.play import record
-from agents.terminal import make_table, print_table
+from agents.terminal import make_table
 from agents.training.run_files import PLAN, PROGRESS, Row, check_plan, read_progress
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import member_for, read_weights
 from dptse_env.utils.files import replacing, require_output
+from dptse_env.utils.progress import make_bar
 from dptse_env.utils.validation import from_mapping, parse_json, require
-from scripts.cli import Machines
+from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, ValidationSeeds
 
 NAME = "weights"
 """Name of the pair of weights in the output folder."""
@@ -50,31 +49,28 @@ GLANCE = 5.0
 """Time between two looks at the learning curves [s]."""
 
 
-@dataclass(frozen=True)
-class Args(Machines):
+@dataclass(frozen=True, kw_only=True)
+class Args(Output, Machines, ValidationSeeds, TrainSeeds, Environments, Command):
     """Train recurrent networks as an estimator."""
 
     kinds: tuple[Kind, ...] = ("flows", "speeds")
     """Kinds of releases: flows (capped, paced), or speeds (printed, corrected)."""
-    seeds: str = "0:3"
-    """Training seeds, first:stop; the best weights on validation traffic are taken."""
     env: tuple[str, ...] = ()
-    """Environments to train in, each an id or 'id {keywords as JSON}', beside sections of random
-    highways; nine roads if not given."""
-    traffic: str = "0:32"
-    """Traffic seeds to train on, first:stop, of 0 to 999."""
+    """Environments to train in, each an id or 'ID {JSON}' with keywords, beside sections of
+    random highways; nine roads if not given."""
     validation_env: tuple[str, ...] = ()
     """Environments to validate in, with a round robin, beside sections of other highways."""
-    validation: str = "1000:1008"
-    """Traffic seeds to validate on, first:stop, of 1000 to 1999."""
     rounds: tuple[str, ...] = ("own:96:64",) * 7
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
     initial: str | None = "highway"
     """Pair of weights to begin with, which also teaches; None for random ones."""
     plan: str = "{}"
     """Further fields of the plan (agents/filters/plan.py) as JSON."""
+    seed: str = "0:3"
+    """Training seeds, first:stop; the best weights on validation traffic are taken."""
+    train_seeds: str = "0:32"
+    validation_seeds: str = "1000:1008"
     output: Path = Path("results/weights")
-    """Folder of the trainings."""
 
 
 Task = tuple[FilterPlan, Path]
@@ -99,7 +95,7 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
     Raises:
         ValueError: An argument is out of range.
     """
-    traffic, initial = parse_seeds(args.traffic, "traffic"), None
+    traffic, initial = parse_seeds(args.train_seeds, "train_seeds"), None
     if args.initial is not None:
         initial = member_for(args.initial, kind == "flows")
     ranges = ScenarioRanges(envs=args.env) if args.env else ScenarioRanges()
@@ -109,7 +105,7 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
         kind=kind,
         seed=seed,
         traffic_seeds=traffic,
-        validation_seeds=parse_seeds(args.validation, "validation"),
+        validation_seeds=parse_seeds(args.validation_seeds, "validation_seeds"),
         validation_envs=args.validation_env,
         ranges=ranges,
         rounds=tuple(parse_round(each) for each in args.rounds),
@@ -124,7 +120,7 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
 
 def main(args: Args) -> None:
     """Record missing traffic, train, and print the keywords that take the weights."""
-    seeds = parse_seeds(args.seeds)
+    seeds = parse_seeds(args.seed, "seed")
     require(bool(args.kinds), "kinds", "one or more", args.kinds)
     tasks = [
         (make_plan(args, kind, seed), args.output / f"{kind}-{seed}")
@@ -152,18 +148,24 @@ def main(args: Args) -> None:
 
             run_shown(executor, work, tasks, take, progress=False)
     table = make_table("on validation traffic", "training", "error x 1000", "on sections", "chi2")
-    for folder, row in sorted(last.items()):
-        errors = [f"{1000 * row[name]:.1f}" for name in ("validation", "sections") if name in row]
-        table.add_row(folder.name, *errors, f"{row['chi2']:.2f}")
-    print_table(table)
+    columns = ("validation", "sections", "chi2")
+    trainings = {
+        folder.name: {name: row[name] for name in columns if name in row}
+        for folder, row in sorted(last.items())
+    }
+    for training, row in trainings.items():
+        errors = [f"{1000 * row[name]:.1f}" if name in row else "" for name in columns[:2]]
+        table.add_row(training, *errors, f"{row['chi2']:.2f}")
     for kind in dict.fromkeys(plan.kind for plan, _ in tasks):
         folders = [folder for plan, folder in tasks if plan.kind == kind]
         best = min(folders, key=lambda folder: last[folder]["validation"])
         with replacing(args.output / f"{NAME}-{kind}.safetensors") as temporary:
             shutil.copyfile(best / WEIGHTS, temporary)
-    settings = {"recurrent": {"weights": str(args.output / NAME)}}
-    print("as keywords of an environment:")
-    print(json.dumps({"estimator": "recurrent", "estimator_settings": settings}))
+    keywords = played_by(args.output / NAME)
+    args.answer(
+        {"trainings": trainings, "keywords": keywords},
+        table, "as keywords of an environment:", json.dumps(keywords),
+    )  # fmt: skip
 
 
 def train(task: Task, records: Path | None, executor: AnyExecutor = THIS_PROCESS) -> Row:
@@ -210,7 +212,7 @@ def followed(tasks: Sequence[Task]) -> Iterator[None]:
     """Show a progress bar of all passes, by the learning curves that trainings write."""
     done = threading.Event()
 
-    def look(bar: tqdm) -> None:
+    def look() -> None:
         while True:
             rows = [read_progress(f) for _, f in tasks if (f / PROGRESS).exists()]
             found = [row["validation"] for each in rows for row in each if "validation" in row]
@@ -220,8 +222,8 @@ def followed(tasks: Sequence[Task]) -> Iterator[None]:
                 return
 
     total = sum(plan.n_passes for plan, _ in tasks)
-    with tqdm(total=total, desc="training", unit="pass") as bar:
-        thread = threading.Thread(target=look, args=(bar,), daemon=True)
+    with make_bar(total, desc="training", unit="pass") as bar:
+        thread = threading.Thread(target=look, daemon=True)
         thread.start()
         try:
             yield

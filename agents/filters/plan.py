@@ -142,8 +142,8 @@ class FilterPlan:
         checked_fields(self, "")
         if not self.validation_envs:
             object.__setattr__(self, "validation_envs", VALIDATION[self.kind])
-        require_seeds("traffic", self.traffic_seeds, TRAINING_SEEDS)
-        require_seeds("validation", self.validation_seeds, VALIDATION_SEEDS)
+        require_seeds("train_seeds", self.traffic_seeds, TRAINING_SEEDS)
+        require_seeds("validation_seeds", self.validation_seeds, VALIDATION_SEEDS)
         integer("windows", self.windows, 1, len(self.traffic_seeds))
         first, stop = self.validation_highways
         apart = (

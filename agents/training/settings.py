@@ -476,8 +476,8 @@ class TrainingPlan:
         """Check values that need no environment."""
         integer("seed", self.seed, 0, TRAININGS - 1)
         require(len(self.envs) > 0, "env", "one or more environments", self.envs)
-        require_seeds("traffic", self.traffic_seeds, TRAINING_SEEDS)
-        require_seeds("validation", self.validation_seeds, VALIDATION_SEEDS)
+        require_seeds("train_seeds", self.traffic_seeds, TRAINING_SEEDS)
+        require_seeds("validation_seeds", self.validation_seeds, VALIDATION_SEEDS)
         if self.minutes is not None:
             positive("minutes", self.minutes)
         if self.steps is not None:

@@ -377,8 +377,11 @@ def test_a_training_may_begin_with_other_weights_and_says_so_on_the_card(tmp_pat
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"traffic_seeds": (1000,)}, r"traffic must be traffic seeds in 0\.\.999, got 1000"),
-        ({"validation_seeds": (5,)}, r"validation must be traffic seeds in 1000\.\.1999, got 5"),
+        ({"traffic_seeds": (1000,)}, r"train_seeds must be traffic seeds in 0\.\.999, got 1000"),
+        (
+            {"validation_seeds": (5,)},
+            r"validation_seeds must be traffic seeds in 1000\.\.1999, got 5",
+        ),
         ({"rounds": (Round(OWN, 1, 1),)}, "rounds must begin with one of another estimator"),
         ({"rounds": ()}, "rounds must begin"),
         ({"windows": 4}, r"windows must be an integer in 1\.\.3, got 4"),

@@ -26,7 +26,7 @@ FIT = "--tries 1 --estimators ekf --rules round-robin --workers 1"
 SEEDS = "--training 0:2 --validation 1000:1002 --test 2000:2002"
 GUIDES = {
     "train-a-policy.md": {
-        "--minutes 8": "--steps 8192 --traffic 0:2 --validation 1000:1002",
+        "--minutes 8": "--steps 8192 --train-seeds 0:2 --validation-seeds 1000:1002",
         "--seeds 2000:2032": "--seeds 2000:2002 --workers 1",
         "dptse suite mine/best.safetensors": "dptse suite mine/best.safetensors --cells short",
         '"0:64"': '"0:2"',
@@ -36,8 +36,8 @@ GUIDES = {
     },
     "your-road.md": {
         "dptse fit my-road.toml": f"dptse fit my-road.toml {FIT} {SEEDS}",
-        "--steps 300000 --traffic 0:8 --validation 1000:1008": (
-            "--steps 8192 --traffic 0:2 --validation 1000:1002"
+        "--steps 300000 --train-seeds 0:8 --validation-seeds 1000:1008": (
+            "--steps 8192 --train-seeds 0:2 --validation-seeds 1000:1002"
         ),
         "--seeds 2000:2016": "--seeds 2000:2002 --workers 1",
     },

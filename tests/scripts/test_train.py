@@ -1,5 +1,6 @@
 """The command: it trains, goes on, trains several seeds, and refuses."""
 
+import io
 import json
 import re
 import shlex
@@ -11,18 +12,24 @@ import pytest
 pytest.importorskip("sb3_contrib")
 pytest.importorskip("tyro")
 
+import tyro
+
+from agents.training.run import least
 from agents.training.run_files import read_progress
+from scripts import train
 from tests.agents.training.plans import SMALL, STEPS, without_time
 from tests.helpers import SHORT, run_killed
 from tests.scripts.commands import refused, run_command
+
+ENV = f'{SHORT} {{"horizon": 64}}'
 
 
 def words(output, algorithm="plackett-luce", *more):
     length = () if algorithm == "plackett-luce" else ("--steps", str(STEPS))
     return [
-        "--env", SHORT, "--keywords", '{"horizon": 64}', *length,
+        "--env", ENV, *length,
         "--algorithm", f"{algorithm} {json.dumps(SMALL[algorithm])}",
-        "--traffic", "0:2", "--validation", "1000:1001", "--output", str(output), *more,
+        "--train-seeds", "0:2", "--validation-seeds", "1000:1001", "--output", str(output), *more,
     ]  # fmt: skip
 
 
@@ -44,16 +51,32 @@ def test_it_trains_and_goes_on(tmp_path):
     assert other == pytest.approx(1000 * rules[rule], abs=0.06)
     away = float(said["share"]) * {"below": 1, "above": -1}[said["side"]]
     assert away == pytest.approx(100 * (1 - error / other), abs=0.2)
-    # The bar has the error beside the best rule's.
-    assert f"validation={said['error']}" in done.stderr
-    assert f"{rule}={said['other']}" in done.stderr
+    assert done.stderr == ""
     command = shlex.split(next_step.partition(": ")[2])
-    env = f'{SHORT} {{"horizon": 64}}'
-    assert command == ["dptse", "evaluate", "--env", env, "--policies", best]
+    assert command == ["dptse", "evaluate", "--env", ENV, "--policies", best]
     before = (tmp_path / "one" / "policy.safetensors").read_bytes()
     assert run_command("train", *given).stdout == done.stdout
+    found = json.loads(run_command("train", *given, "--json").stdout)
+    (training,), named = found["trainings"], ("policy", "best_rule")
+    assert [training[name] for name in named] == [best, rule]
+    assert training["error"] == pytest.approx(error / 1000, abs=6e-5)
+    assert shlex.split(found["next"]) == command
     assert (tmp_path / "one" / "policy.safetensors").read_bytes() == before
-    assert "seed is 0 there and 1 now" in refused("train", *given, "--seeds", "1")
+    assert "seed is 0 there and 1 now" in refused("train", *given, "--seed", "1")
+
+
+def test_the_bar_has_the_error_beside_the_best_rules(tmp_path, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    train.main(tyro.cli(train.Args, args=words(tmp_path, "ppo")))
+    rules = json.loads((tmp_path / "rules.json").read_text())
+    rule, bar = min(rules, key=rules.get), sys.stderr.getvalue()
+    errors = [1000 * least(row) for row in read_progress(tmp_path)]
+    assert f"{rule}={1000 * rules[rule]:.1f}" in bar
+    assert all(f"validation={error:.1f}" in bar for error in errors)
 
 
 @pytest.mark.parametrize(
@@ -62,9 +85,11 @@ def test_it_trains_and_goes_on(tmp_path):
         (["--algorithm", "dqn"], "algorithm must be one of ppo, .*, plackett-luce where bandwidth"),
         (["--minutes", "0"], "minutes must be a finite number > 0, got 0"),
         (["--steps", "-3"], "steps must be an integer >= 1, got -3"),
-        (["--traffic", "998:1001"], r"traffic must be traffic seeds in 0\.\.999, got 1000"),
-        (["--validation", "2000"], r"validation must be traffic seeds in 1000\.\.1999, got 2000"),
-        (["--keywords", "3"], "keywords must be a JSON object, got"),
+        (["--train-seeds", "998:1001"], r"train_seeds must be .* in 0\.\.999, got 1000"),
+        (["--validation-seeds", "2000"], r"validation_seeds must be .* 1000\.\.1999, got 2000"),
+        (["--env"], r"env must be one or more environments, got \(\)"),
+        (["--traffic", "0:2"], "--traffic is --train-seeds now"),
+        (["--keywords", "{}"], r"--keywords is part of --env, 'ID {JSON}' now"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(more, message, tmp_path):
@@ -75,7 +100,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(more, message, tmp_path):
 
 
 def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
-    given = words(tmp_path, "plackett-luce", "--seeds", "0:2", "--workers", "1")
+    given = words(tmp_path, "plackett-luce", "--seed", "0:2", "--workers", "1")
     done = run_command("train", *given)
     best = [str(tmp_path / seed / "best.safetensors") for seed in "01"]
     *lines, next_step = done.stdout.splitlines()

@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 from itertools import product
 
@@ -25,10 +26,9 @@ PLAN = {
     "ranges": {"sections": 0.0, "highways": [0, 1], "schedules": ["round-robin"]},
 }
 SMALL = [
-    "--env", SHORT, "--traffic", "0:2", "--validation-env", SHORT, "--validation", "1000:1001",
-    "--initial", "None", "--rounds", "ekf:1:2", "own:1:1", "--seeds", "0:2", "--workers", "1",
-    "--plan",
-    json.dumps(PLAN),
+    "--env", SHORT, "--train-seeds", "0:2", "--validation-env", SHORT,
+    "--validation-seeds", "1000:1001", "--initial", "None", "--rounds", "ekf:1:2", "own:1:1",
+    "--seed", "0:2", "--workers", "1", "--plan", json.dumps(PLAN),
 ]  # fmt: skip
 
 
@@ -38,12 +38,20 @@ def arguments(output, *more):
 
 def test_it_trains_a_pair_that_an_environment_takes(tmp_path, capsys):
     train_estimator.main(arguments(tmp_path))
-    keywords = json.loads(capsys.readouterr().out.splitlines()[-1])
-    best = {}
+    printed = capsys.readouterr().out
+    keywords, best = json.loads(printed.splitlines()[-1]), {}
+    train_estimator.main(arguments(tmp_path, "--json"))
+    found = json.loads(capsys.readouterr().out)
+    assert found["keywords"] == keywords
     for kind, seed in product(("flows", "speeds"), (0, 1)):
         rows = read_progress(tmp_path / f"{kind}-{seed}")
         assert [row["round"] for row in rows] == [1, 1, 2]
         best.setdefault(kind, []).append((rows[-1]["validation"], seed))
+        said = found["trainings"][f"{kind}-{seed}"]
+        assert said == {name: rows[-1][name] for name in ("validation", "chi2")}
+        assert re.search(
+            rf"{kind}-{seed} +{1000 * said['validation']:.1f} +{said['chi2']:.2f}", printed
+        )
     for kind, privacy in (("flows", "capped"), ("speeds", "printed")):
         taken = read_weights(str(tmp_path / f"weights-{kind}.safetensors")).card["name"]
         assert taken == f"{kind}-{min(best[kind])[1]}"
@@ -62,7 +70,7 @@ def test_rounds_are_read_from_text():
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--traffic", "0:2000"], r"traffic must be traffic seeds in 0\.\.999"),
+        (["--train-seeds", "0:2000"], r"train_seeds must be traffic seeds in 0\.\.999"),
         (["--rounds", "own:0:4"], r"rounds\.scenarios must be an integer in 1\.\."),
         (["--plan", "[3]"], "plan must be a mapping"),
         (["--plan", "{"], "plan must be JSON: "),

@@ -28,8 +28,8 @@ COMMANDS = [
     ["info"],
     ["record", *SHORT, "--train-seeds", "0:2", "--json"],
     [
-        "train", "--env", BRIEFLY, "--traffic", "0:2",
-        "--validation", "1000:1002", "--output", "trained", "--algorithm",
+        "train", "--env", BRIEFLY, "--train-seeds", "0:2",
+        "--validation-seeds", "1000:1002", "--output", "trained", "--algorithm",
         'plackett-luce {"n_envs": 4, "regression": {"rounds": 1, "batches": 2}, '
         '"swaps": {"rounds": 1, "episodes": 2, "batches": 2}}',
     ],

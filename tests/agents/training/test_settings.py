@@ -81,8 +81,8 @@ def env(**keywords):
     ("changes", "message"),
     [
         ({"seed": -1}, r"seed must be an integer in 0\.\.999, got -1"),
-        ({"traffic_seeds": (0, 2000)}, r"traffic must be traffic seeds in 0\.\.999, got 2000"),
-        ({"validation_seeds": (0,)}, r"validation must be .* 1000\.\.1999, got 0"),
+        ({"traffic_seeds": (0, 2000)}, r"train_seeds must be traffic seeds in 0\.\.999, got 2000"),
+        ({"validation_seeds": (0,)}, r"validation_seeds must be .* 1000\.\.1999, got 0"),
         ({"envs": ()}, r"env must be one or more environments, got \(\)"),
         ({"envs": env(action="mask")}, "env: action is chosen by the training"),
         ({"envs": (f"{SHORT} 3",)}, "env must be an id and a JSON object, got"),
