@@ -37,6 +37,7 @@ reproduce: setup  ## Write the reports of all studies anew, after playing what t
 	$(BIN)/dptse study paper
 	$(BIN)/dptse study guarantees
 	$(BIN)/dptse study estimators
+	$(BIN)/dptse study roads
 	$(BIN)/dptse study policies
 	$(BIN)/dptse study suite
 

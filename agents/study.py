@@ -45,9 +45,6 @@ ORIGIN = ("study", "version", "cell")
 Report = Callable[[pl.DataFrame, Path], str]
 """Makes Markdown of the rows of a study, and draws figures into its folder."""
 
-Follow = Callable[[pl.DataFrame, Path], Sequence[Cell]]
-"""Returns the cells that the rows of other cells ask for."""
-
 
 class Place(NamedTuple):
     """The folder, executor and records that a study works with.
@@ -63,6 +60,10 @@ class Place(NamedTuple):
     records: Records = None
 
 
+Follow = Callable[[pl.DataFrame, Place], Sequence[Cell]]
+"""Returns the cells that the rows of other cells ask for, once what they name is there."""
+
+
 @dataclass(frozen=True)
 class Study:
     """A question, as cells and a report.
@@ -73,7 +74,7 @@ class Study:
         seeds: Traffic seeds of every cell that has none of its own.
         report: Makes Markdown of the rows, of whatever version, and draws the figures.
         follow: Returns the cells that the rows of the first ones ask for, such as those of a policy
-            that validation has chosen.
+            that validation has chosen. It may train that policy first.
         measures: Further tables that the report reads, by the name of their file in the folder;
             each is measured once.
     """
@@ -102,7 +103,7 @@ def run(study: Study, place: Place, progress: bool = True) -> None:
     """
     rows = play_study(study, place, progress)
     if study.follow is not None:
-        _play_missing(study, study.follow(rows, place.folder), place, progress)
+        _play_missing(study, study.follow(rows, place), place, progress)
     for name, measure in study.measures.items():
         if not (place.folder / name).exists():
             write_table(place.folder / name, measure(place))

@@ -51,6 +51,7 @@ from agents.tables import (
     values_of,
 )
 from agents.watchers import JUMP, LEVELS, REGIMES, SLOW
+from dptse_env.utils.validation import convert
 
 PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
 SHORT = "dptse_env:dptse/ShortHighway-v0"
@@ -475,10 +476,18 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
 STUDY = Study("estimators", (*WORLD_CELLS, *SENSED_CELLS), SEEDS, report)
 
 
-def study(weights: Sequence[str]) -> Study:
-    """Return the study with weights of other training seeds, numbered from 1 on."""
+def study(weights: Sequence[str] = ()) -> Study:
+    """Return the study with weights of other training seeds, numbered from 1 on.
+
+    Args:
+        weights: Each a name or what the files of a pair begin with.
+
+    Raises:
+        ValueError: They are no list of texts.
+    """
+    numbered = enumerate(convert(tuple[str, ...], weights, "weights"), start=1)
     more = [
         world_cell(world, LEARNED, network=number, weights=each)
-        for world, (number, each) in product(WORLDS, enumerate(weights, start=1))
+        for world, (number, each) in product(WORLDS, numbered)
     ]
     return dataclasses.replace(STUDY, cells=(*STUDY.cells, *more))

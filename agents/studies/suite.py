@@ -490,5 +490,5 @@ STUDY = Study(
     rule_cells(),
     SEEDS,
     report,
-    follow=lambda rows, folder: [each for each in learned_cells() if _fits(each)],
+    follow=lambda rows, place: [each for each in learned_cells() if _fits(each)],
 )

@@ -87,7 +87,7 @@ def test_rows_of_equal_numbers_count_as_played_and_others_do_not(tmp_path, monke
 
 
 def test_cells_may_follow_from_rows(tmp_path):
-    def follow(rows, folder):
+    def follow(rows, place):
         best = rows.group_by("bandwidth").agg(pl.col("reward").mean()).sort("reward")
         chosen = int(best["bandwidth"][-1])
         keywords = {**KEYWORDS, "bandwidth": chosen}

@@ -1,10 +1,12 @@
+import json
 import re
 from dataclasses import replace
 
 import polars as pl
 import pytest
 
-from agents.study import read_rows
+from agents.executors import THIS_PROCESS
+from agents.study import Place, read_rows
 from examples.my_study import STUDY
 from scripts.study import STUDIES, Args, find_study, main
 from tests.scripts.commands import run_command
@@ -15,6 +17,10 @@ MANY = replace(STUDY.cells[0], keywords={**STUDY.cells[0].keywords, "bandwidth":
 WIDE = replace(STUDY, cells=(MANY, *STUDY.cells[1:]), measures={"trips.parquet": lambda _: None})
 MIXED = (FIRST, *STUDY.cells[1:])
 ROADS = replace(STUDY, cells=MIXED, follow=lambda rows, folder: MIXED)
+
+
+def numbered(number):
+    return number and replace(STUDY, seeds=tuple(range(2000, 2000 + number)))
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -33,9 +39,17 @@ def test_every_study_is_found_and_a_cell_has_one_set_of_labels(name):
         ({"name": "moon"}, "study must be one of paper, guarantees, .*, got 'moon'"),
         ({"name": "no_such_module:STUDY"}, "'no_such_module:STUDY' cannot be imported"),
         ({"name": "examples.my_study:CELLS"}, "must be a Study, got tuple"),
-        ({"name": MINE, "train": 1.0}, "train is an argument of the study policies, not of"),
-        ({"name": "paper", "weights": ("a",)}, "weights is an argument of the study estim"),
-        ({"name": MINE, "seeds": "all"}, "must be 'first:stop' or one seed, got 'all'"),
+        ({"name": f'{MINE} {{"minutes": 1}}'}, "keywords of the study .*:STUDY must be none"),
+        ({"name": 'roads {"minutes": 1}'}, "study roads takes weights: .*argument 'minutes'"),
+        ({"name": 'roads {"weights": 3}'}, "weights must be"),
+        ({"name": 'estimators {"weights": [3]}'}, "weights"),
+        ({"name": 'roads {"weights"}'}, "study must be JSON"),
+        ({"name": "roads 3"}, "study must be a name and a JSON object, got '3'"),
+        ({"name": f"{__name__}:numbered"}, "study .*:numbered takes number: missing"),
+        ({"name": f'{__name__}:numbered {{"number": 0}}'}, "must be a Study, got int"),
+        ({"name": 'policies {"minutes": 0}'}, r"minutes must be .*, got 0"),
+        ({"name": MINE, "test_seeds": "all"}, "must be 'first:stop' or one seed, got 'all'"),
+        ({"name": MINE, "env": (SHORT,), "report": True}, "env must be left out where nothing"),
         ({"name": MINE, "workers": 0}, "workers must be an integer >= 1"),
     ],
 )
@@ -68,26 +82,30 @@ def test_the_cells_of_an_environment_are_played_with_its_keywords_and_others_are
 
 
 def test_seeds_and_environments_can_be_others_with_an_output_of_their_own():
-    for changes in ({"seeds": "2900:2902"}, {"env": (SHORT,)}):
+    of_four = f'{__name__}:numbered {{"number": 4}}'
+    for changes in ({"test_seeds": "2900:2902"}, {"env": (SHORT,)}, {"name": of_four}):
         with pytest.raises(ValueError, match="given with an output of its own"):
-            main(Args(name=MINE, **changes))
+            main(Args(**{"name": MINE, **changes}))
+    assert find_study(Args(name=of_four)).seeds == (2000, 2001, 2002, 2003)
     assert find_study(Args(name=f"{__name__}:WIDE")).measures
-    study = find_study(Args(name=f"{__name__}:WIDE", seeds="2900:2902", env=(SHORT,)))
+    study = find_study(Args(name=f"{__name__}:WIDE", test_seeds="2900:2902", env=(SHORT,)))
     assert (study.seeds, study.measures) == ((2900, 2901), {})
 
 
 def test_choices_keep_their_validation_traffic_on_other_seeds(tmp_path):
-    study = find_study(Args(name="policies", seeds="2900:2902", quick=True))
-    cells = [*study.cells, *study.follow(pl.DataFrame(), tmp_path)]
+    study = find_study(Args(name="policies", test_seeds="2900:2902", quick=True))
+    cells = [*study.cells, *study.follow(pl.DataFrame(), Place(tmp_path, THIS_PROCESS))]
     seeds = {cell.labels["part"]: study.seeds_of(cell) for cell in cells}
     assert seeds == {"validation": (1000, 1001, 1002), "test": (2900, 2901)}
 
 
 @pytest.mark.slow
 def test_a_study_of_ones_own_runs_from_the_command_line(tmp_path):
-    words = (MINE, "--output", str(tmp_path / "out"), "--workers", "1")
-    done = run_command("study", *words)
+    words = (MINE, "--output", str(tmp_path / "out"))
+    done = run_command("study", *words, "--workers", "1", "--json")
     assert done.returncode == 0, done.stderr
+    files = ["errors.png", "rows.parquet", "tables.md"]
+    assert json.loads(done.stdout) == {"folder": str(tmp_path / "out"), "files": files}
     rows = read_rows("my-study", tmp_path / "out")
     assert len(rows) == len(STUDY.cells) * len(STUDY.seeds)
     tables = (tmp_path / "out" / "tables.md").read_text("utf-8")

@@ -4,16 +4,17 @@ In each setting rules and oracles play, and policies that algorithms of ``dptse 
 for the same time. Validation traffic chooses the best rule, the checkpoint and the mode of every
 training, and the learners that get further training seeds. Then all play test traffic, once.
 
-``--train MINUTES`` trains what is missing, in ``trainings/SETTING/LEARNER/SEED`` of the output:
-every learner with the first of ``--training-seeds``, the best two of a setting with the others. The
+With ``minutes`` it trains what is missing, in ``trainings/SETTING/LEARNER/SEED`` of the output:
+every learner with the first of the training seeds, the best two of a setting with the others. The
 same command goes on after a kill. The report needs the rows and ``curves.parquet`` alone.
 
-dptse study policies --train 1 --training-seeds 0:5 --workers 2
+dptse study 'policies {"minutes": 1, "seeds": "0:5"}' --output results/policies --workers 2
 dptse study policies --report
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from itertools import chain, product
 from pathlib import Path
@@ -42,7 +43,7 @@ from agents.play import Cell
 from agents.policies import find_policy
 from agents.seeds import STUDY_TEST, TRAINING_VALIDATION
 from agents.statistics import Interval, bootstrap, interquartile_mean, percent_below, percent_of_way
-from agents.study import Study, read_table
+from agents.study import Place, Study, read_table
 from agents.tables import (
     ERROR,
     Labels,
@@ -55,6 +56,7 @@ from agents.tables import (
 )
 from dptse_env.config import parse_seeds
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.validation import positive
 
 Statistic = Callable[..., FloatArray]
 
@@ -182,7 +184,7 @@ def _cell(
     )
 
 
-def test_cells(rows: pl.DataFrame, folder: Path) -> list[Cell]:
+def test_cells(rows: pl.DataFrame, place: Place) -> list[Cell]:
     """Return what plays test traffic.
 
     Rules, oracles, policies of the package, and the best ones of the trainings that are finished.
@@ -193,9 +195,11 @@ def test_cells(rows: pl.DataFrame, folder: Path) -> list[Cell]:
         _cell(name, policy, TEST, digest=find_policy(policy).identity)
         for name, policy in SHIPPED.items()
     ]
-    trained = read_curves(folder).select("setting", "policy", "training_seed", "digest").unique()
+    trained = (
+        read_curves(place.folder).select("setting", "policy", "training_seed", "digest").unique()
+    )
     for setting, learner, seed, digest in trained.sort(pl.all()).iter_rows():
-        file = training_folder(folder, setting, learner, seed) / "best.safetensors"
+        file = training_folder(place.folder, setting, learner, seed) / "best.safetensors"
         if setting in SETTINGS and file.exists():
             cells.append(_cell(setting, learner, TEST, seed, digest, file=str(file)))
     return cells
@@ -518,3 +522,26 @@ STUDY = Study(
     report,
     test_cells,
 )
+
+
+def study(minutes: float | None = None, seeds: str = "0:5") -> Study:
+    """Return the study, which trains what is missing if a time is given.
+
+    Args:
+        minutes: Time of each training.
+        seeds: Training seeds, first:stop. Every learner has the first, the best two have all.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+    if minutes is None:
+        return STUDY
+    time, training_seeds = positive("minutes", minutes), parse_seeds(seeds)
+
+    def follow(rows: pl.DataFrame, place: Place) -> list[Cell]:
+        from agents.studies.policies.trainings import train_ladder  # noqa: PLC0415 (needs torch)
+
+        train_ladder(rows, place, time, training_seeds)
+        return test_cells(rows, place)
+
+    return dataclasses.replace(STUDY, follow=follow)

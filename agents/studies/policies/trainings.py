@@ -29,13 +29,12 @@ from agents.studies.policies import (
     training_folder,
     validation_error,
 )
-from agents.study import Place, Study, play_study, write_table
+from agents.study import Place, write_table
 from agents.training.run import BEST, CURVE, RULES_FILE
 from agents.training.run_files import PLAN, check_plan, keep_plan, read_progress
 from agents.training.settings import TrainingPlan, parse_algorithm
 from agents.training.training import require_trained, train
 from dptse_env.traffic import Records
-from dptse_env.utils.validation import positive
 
 BEST_LEARNERS = 2
 """Learners of each setting that are trained with every training seed."""
@@ -70,14 +69,14 @@ class Training(NamedTuple):
         return training_folder(study, *self)
 
 
-def train_ladder(study: Study, place: Place, minutes: float, seeds: Sequence[int]) -> None:
+def train_ladder(rows: pl.DataFrame, place: Place, minutes: float, seeds: Sequence[int]) -> None:
     """Train what is missing, and keep the learning curves in the folder of the study.
 
     Every learner is trained with the first seed, the best of each setting with the others, too.
 
     Args:
-        study: The study of policies.
-        place: Its folder, and what runs the trainings, side by side.
+        rows: Rows of the rules on validation traffic.
+        place: Folder of the study, and what runs the trainings, side by side.
         minutes: Time of each training.
         seeds: Training seeds.
 
@@ -86,8 +85,6 @@ def train_ladder(study: Study, place: Place, minutes: float, seeds: Sequence[int
         OSError: A folder cannot be written.
         ExecutorError: Workers died again and again, or write to other disks than this machine's.
     """
-    positive("train", minutes)
-    rows = play_study(study, place)
     rules = {
         name: {rule: validation_error(rows, name, rule) / 1000.0 for rule in RULES}
         for name in SETTINGS

@@ -1,10 +1,10 @@
 """Estimators on roads that nobody trained on: own roads, sections of longer ones, other simulators.
 
 Every vehicle answers queries, which go round robin. The filters have the parameters and settings
-that were calibrated for PrivateHighway-v1. Weights other than those of the package are given by
-``--weights``; rows of the others are played once.
+that were calibrated for PrivateHighway-v1. Weights other than those of the package are given with
+the name of the study; rows of the others are played once.
 
-dptse study roads --weights results/weights/seed-2/roads --output results/mine
+dptse study 'roads {"weights": ["results/weights/seed-2/roads"]}' --output results/mine
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from agents.tables import (
 )
 from dptse_env.estimators.recurrent import member_for, shipped_weights
 from dptse_env.utils.files import file_digest
+from dptse_env.utils.validation import convert
 
 PRIVATE, PAPER = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/PaperHighway-v0"
 LONG = "dptse_env:dptse/LongHighway-v0"
@@ -171,7 +172,9 @@ def study(weights: Sequence[str] = ()) -> Study:
 
     Raises:
         FileNotFoundError: There are no such weights.
+        ValueError: They are no list of texts.
     """
+    weights = convert(tuple[str, ...], weights, "weights")
     who = [(name, "", "") for name in (*FILTERS, RECURRENT, MIXTURE)]
     who += [(RECURRENT, each, named(each)) for each in weights]
     cells = [

@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from agents.statistics import bootstrap, percent_below, percent_of_way
 from agents.studies import policies
 from agents.studies.policies import GAIN, ORACLE, ROUND_ROBIN, RULES, STARTED, TEST, VALIDATION
 from agents.studies.policies.trainings import START, Training, fits, plan_of, train_ladder
-from agents.study import Place, read_rows, read_table, run, write_report, write_table
+from agents.study import Place, play_study, read_rows, read_table, run, write_report, write_table
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.policies import read_policy, shipped_policies
 from tests.agents.training.plans import SMALL
@@ -170,7 +171,7 @@ def test_traffic_of_trainings_choices_and_tests_is_apart():
 
 
 def test_policies_of_the_package_suit_their_settings(tmp_path):
-    cells = policies.test_cells(pl.DataFrame(), tmp_path)
+    cells = policies.test_cells(pl.DataFrame(), Place(tmp_path, THIS_PROCESS))
     found = {cell.labels["setting"]: cell for cell in cells if cell.transferred}
     assert {name: cell.policy for name, cell in found.items()} == policies.SHIPPED
     assert set(policies.SHIPPED.values()) < set(shipped_policies())
@@ -207,13 +208,6 @@ def test_what_a_training_starts_from_has_half_of_its_time():
     assert plan_of(Training("long", "ppo-road", 0), Path(), 10.0).algorithm.validations == 2
 
 
-def test_a_time_that_is_none_is_refused_and_nothing_written(tmp_path):
-    place = Place(tmp_path / "out", THIS_PROCESS)
-    with pytest.raises(ValueError, match=r"train must be .*, got 0\.0"):
-        train_ladder(policies.STUDY, place, 0.0, (0,))
-    assert not place.folder.exists()
-
-
 @pytest.mark.slow
 def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     keywords = {"estimator": "random_walk", "bandwidth": 1, "horizon": 80, "privacy": "capped"}
@@ -231,25 +225,25 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
         monkeypatch.setattr(module, "RULES", (ROUND_ROBIN, OTHER))
     monkeypatch.setattr(policies, "SHIPPED", {})
     cells = tuple(policies._cell("short", rule, VALIDATION) for rule in (ROUND_ROBIN, OTHER))
-    study = policies.Study("policies", cells, (), policies.report, policies.test_cells)
+    monkeypatch.setattr(policies, "STUDY", replace(policies.STUDY, cells=cells))
     place = Place(tmp_path, THIS_PROCESS)
-    train_ladder(study, place, 0.05, (0,))
+    validated = play_study(policies.STUDY, place)
+    train_ladder(validated, place, 0.05, (0,))
     curves = read_table(tmp_path / policies.CURVES)
     assert set(curves["policy"]) == set(learners)
     kept = tmp_path / "trainings" / "short" / "qr-dqn" / "0" / "checkpoint.pt"
     before = kept.stat().st_mtime_ns
     shutil.rmtree(tmp_path / "trainings" / "short" / "plackett-luce")  # as one that was killed
-    train_ladder(study, place, 0.05, (0, 1))
+    run(policies.study(0.05, "0:2"), place, progress=False)
     assert kept.stat().st_mtime_ns == before
     curves = read_table(tmp_path / policies.CURVES)
     seeds = curves.group_by("policy").agg(pl.col("training_seed").n_unique())
     assert sorted(seeds["training_seed"]) == [1, 1, 2, 2]
     started = curves.filter(policy=STARTED, training_seed=0)
     assert started["seconds"].min() > 0.0
-    run(study, place, progress=False)
     rows = read_rows("policies", tmp_path).filter(part=TEST)
     assert rows["cell"].n_unique() == 2 + 2 + 6
     assert rows.filter(policy=GAIN)["traffic_seed"].n_unique() == 2
     assert "| plackett-luce |" in (tmp_path / "tables.md").read_text("utf-8")
     with pytest.raises(ValueError, match=r"another plan: minutes is 0\.05 there and 0\.1 now"):
-        train_ladder(study, place, 0.1, (0,))
+        train_ladder(validated, place, 0.1, (0,))
