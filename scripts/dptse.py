@@ -48,45 +48,6 @@ RENAMED: dict[str, dict[str, str]] = {
     "info": {"--mu": "dptse_env.privacy.over_trips, a function,"},
     "record": {"--seeds": "--train-seeds, --validation-seeds or --test-seeds"},
     "study": {
-        "study": "run a study and write its report",
-        "audit": "attack the privacy of an environment",
-    },
-}
-"""Commands by what a person wants. Each is a module of this folder with ``Args`` and ``main``."""
-
-ANEW = ("audit", "import", "info")
-"""Commands that begin anew after an interruption, as others do with --force."""
-
-GONE = {
-    "suite": "evaluate --suite",
-    "tune": "fit --tune",
-    "policy": "import policy",
-    "replay-field": "import field, and then evaluate",
-}
-"""What has the place of commands that there were."""
-
-RENAMED: dict[str, dict[str, str]] = {
-    "audit": {},
-    "evaluate": {},
-    "fit": {},
-    "import": {},
-    "info": {"--mu": "dptse_env.privacy.over_trips, a function,"},
-    "record": {"--seeds": "--train-seeds, --validation-seeds or --test-seeds"},
-    "study": {},
-    "train": {
-        "--seeds": "--seed",
-        "--traffic": "--train-seeds",
-        "--validation": "--validation-seeds",
-        "--keywords": "part of --env, 'ID {JSON}'",
-    },
-    "train-estimator": {
-        "--seeds": "--seed",
-        "--traffic": "--train-seeds",
-        "--validation": "--validation-seeds",
-    },
-    "info": {},
-    "record": {},
-    "study": {
         "--seeds": "--test-seeds",
         "--train": """part of the name, 'policies {"minutes": 1}'""",
         "--training-seeds": """part of the name, 'policies {"minutes": 1, "seeds": "0:5"}'""",
