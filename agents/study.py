@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import polars as pl
 
-from agents.executors import AnyExecutor, ThisProcess, run_shown
+from agents.executors import Executor, run_shown, this_process
 from agents.play import Cell, corridor_of, play, record
 from agents.tables import are_present, numbers
 from dptse_env.traffic import Records
@@ -56,7 +56,7 @@ class Place(NamedTuple):
     """
 
     folder: Path
-    executor: AnyExecutor
+    executor: Executor
     records: Records = None
 
 
@@ -167,7 +167,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
     for corridor, seeds in dict.fromkeys((corridor_of(cell), seeds) for cell, seeds in missing):
         record(corridor, seeds, place.records, progress=progress)
     folder = place.folder / PARTS
-    threads = None if isinstance(place.executor, ThisProcess) else 1
+    threads = None if place.executor is this_process else 1
     if missing:
         folder.mkdir(exist_ok=True)
     run_shown(

@@ -21,7 +21,7 @@ from rich.table import Table
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from agents.environments import parse_env, preset_of, quietly
-from agents.executors import AnyExecutor, ExecutorError, ExecutorName, make_executor
+from agents.executors import Executor, ExecutorError, ExecutorName, make_executor
 from agents.play import PlayError, record
 from agents.study import Place
 from agents.terminal import print_table
@@ -199,7 +199,7 @@ class Machines(Recording):
     address: str | None = None
     """Address of the Ray cluster, or auto; see RAY_ADDRESS, too."""
 
-    def start_executor(self) -> AnyExecutor:
+    def start_executor(self) -> Executor:
         """Return what runs the tasks.
 
         Raises:

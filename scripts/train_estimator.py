@@ -26,7 +26,7 @@ from typing import Any
 import torch
 
 from agents.environments import make_config, parse_env, quietly
-from agents.executors import THIS_PROCESS, AnyExecutor, run_shown
+from agents.executors import Executor, run_shown, this_process
 from agents.filters.highways import draw_highway
 from agents.filters.plan import FilterPlan, Round, played_by
 from agents.filters.scenarios import Kind, ScenarioRanges
@@ -168,7 +168,7 @@ def main(args: Args) -> None:
     )  # fmt: skip
 
 
-def train(task: Task, records: Path | None, executor: AnyExecutor = THIS_PROCESS) -> Row:
+def train(task: Task, records: Path | None, executor: Executor = this_process) -> Row:
     """Run a training to its end, and return the last row of its learning curve."""
     plan, folder = task
     torch.set_num_threads(1)
@@ -177,7 +177,7 @@ def train(task: Task, records: Path | None, executor: AnyExecutor = THIS_PROCESS
     return training.rows[-1]
 
 
-def record_all(args: Args, plans: Sequence[FilterPlan], executor: AnyExecutor) -> None:
+def record_all(args: Args, plans: Sequence[FilterPlan], executor: Executor) -> None:
     """Record the traffic of the environments and highways of plans that is missing."""
     wanted = dict.fromkeys(
         (env, seeds)

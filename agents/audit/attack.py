@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from agents.audit.worlds import Worlds, audited
-from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
+from agents.executors import Executor, run_in_order, this_process
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate, Measurement
 from dptse_env.parts import make_release, make_traffic
@@ -172,7 +172,7 @@ def attack(
     noise_factor: float = 1.0,
     seed: int = 0,
     batch: int = BATCH,
-    executor: AnyExecutor = THIS_PROCESS,
+    executor: Executor = this_process,
     progress: bool = True,
 ) -> Runs:
     """Play both worlds and score every transcript.

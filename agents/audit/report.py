@@ -23,7 +23,7 @@ from agents.audit.statistics import (
     detectable_mu,
     rejection_probability,
 )
-from agents.executors import THIS_PROCESS, AnyExecutor
+from agents.executors import Executor, this_process
 from agents.files import write_json
 from agents.terminal import make_table, print_table, print_text
 from dptse_env.config import EnvConfig
@@ -161,7 +161,7 @@ def audit_environment(
     noise_factor: float = 1.0,
     confidence: float = 0.95,
     seed: int = 0,
-    executor: AnyExecutor = THIS_PROCESS,
+    executor: Executor = this_process,
 ) -> Finding:
     """Test the noise, choose two worlds, play both, and test the claim to users.
 

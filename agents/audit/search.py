@@ -15,7 +15,7 @@ import numpy as np
 from agents.audit.attack import overheard
 from agents.audit.planner import PUBLIC_SCHEDULES, Planner, public_plan, random_plan
 from agents.audit.worlds import AdjacentWorlds, Trajectory, Worlds
-from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
+from agents.executors import Executor, run_in_order, this_process
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_task
 from dptse_env.traffic import Record
@@ -152,7 +152,7 @@ def climb(
     *,
     policy: str = "hunter",
     seed: int = 0,
-    executor: AnyExecutor = THIS_PROCESS,
+    executor: Executor = this_process,
 ) -> tuple[AdjacentWorlds, BoolArray]:
     """Return the worlds and queries of the largest distance that a search reaches.
 

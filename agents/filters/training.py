@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.executors import THIS_PROCESS, AnyExecutor, run_in_order
+from agents.executors import Executor, run_in_order, this_process
 from agents.filters.collecting import Batch, Episodes, collect, draw_batch
 from agents.filters.network import RecurrentNetwork, second_loss, teacher_loss
 from agents.filters.plan import OWN, FilterPlan, played_by
@@ -96,7 +96,7 @@ class FilterTraining:
         *,
         records: Records = None,
         watchers: Sequence[Watcher] = (),
-        executor: AnyExecutor = THIS_PROCESS,
+        executor: Executor = this_process,
     ) -> None:
         """Restore the state of the folder, if there is one.
 

@@ -30,7 +30,7 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, Jou
 from optuna.trial import FrozenTrial, TrialState
 
 from agents.environments import make_config, parse_env, quietly
-from agents.executors import AnyExecutor, run_shown
+from agents.executors import Executor, run_shown
 from agents.files import first_difference
 from agents.play import Cell, play
 from agents.search.space import (
@@ -170,7 +170,7 @@ class Search:
         }
 
 
-def tune(search: Search, folder: Path, n_trials: int, executor: AnyExecutor) -> optuna.Study:
+def tune(search: Search, folder: Path, n_trials: int, executor: Executor) -> optuna.Study:
     """Run trials until ``n_trials`` are finished, those of earlier runs included.
 
     The first ones are the defaults and the settings that the environment has without a search;

@@ -10,7 +10,7 @@ import gymnasium as gym
 import torch
 
 from agents.environments import make_vector
-from agents.executors import AnyExecutor, ExecutorError, run_shown
+from agents.executors import Executor, ExecutorError, run_shown
 from agents.files import write_json
 from agents.play import record
 from agents.seeds import training_seed
@@ -141,7 +141,7 @@ def _regress(
 
 def train_all(
     plans: Mapping[Path, TrainingPlan],
-    executor: AnyExecutor,
+    executor: Executor,
     *,
     records: Records = None,
     threads: int = 1,

@@ -1,6 +1,6 @@
 import pytest
 
-from agents.executors import THIS_PROCESS
+from agents.executors import this_process
 from agents.study import Place, run
 from tests.agents.faults import TRACES, rows_of, study
 
@@ -18,5 +18,5 @@ def traces(tmp_path, monkeypatch):
 def expected(tmp_path_factory):
     """Rows of the study that no fault befalls."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    run(study(), Place(folder, THIS_PROCESS), progress=False)
+    run(study(), Place(folder, this_process), progress=False)
     return rows_of(folder)

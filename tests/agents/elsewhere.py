@@ -2,12 +2,9 @@
 
 import pickle
 
-from agents.executors import ThisProcess
 
-
-class Elsewhere(ThisProcess):
-    """Runs tasks as another process would: on copies, by what is pickled of them."""
-
-    def submit(self, fn, /, *args, **kwargs):
-        call, copies = pickle.loads(pickle.dumps((fn, args)))
-        return super().submit(lambda: pickle.loads(pickle.dumps(call(*copies))))
+def elsewhere(work, tasks):
+    """Run tasks as another process would: on copies, by what is pickled of them."""
+    for index, task in enumerate(tasks):
+        call, copy = pickle.loads(pickle.dumps((work, task)))
+        yield index, pickle.loads(pickle.dumps(call(copy)))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import polars as pl
 
-from agents.executors import LocalProcesses, RayCluster
+from agents.executors import make_executor
 from agents.play import Cell
 from agents.study import Place, Study, run
 from dptse_env.schedules.rules import OldestFirst
@@ -66,5 +66,5 @@ def rows_of(folder):
 
 
 if __name__ == "__main__":
-    executor = RayCluster(sys.argv[2]) if len(sys.argv) > 2 else LocalProcesses(2)
+    executor = make_executor("ray" if len(sys.argv) > 2 else "local", 2, *sys.argv[2:])
     run(study(), Place(Path(sys.argv[1]), executor), progress=False)

@@ -6,18 +6,17 @@ import subprocess
 import sys
 import threading
 import warnings
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 
 import loky
 import pytest
 
 from agents.executors import (
     ExecutorError,
-    LocalProcesses,
-    ThisProcess,
     make_executor,
     run_in_order,
     run_shown,
+    this_process,
 )
 from dptse_env.utils.kernels import compiling_is_said
 from dptse_env.utils.registry import MissingExtraError
@@ -32,38 +31,36 @@ def reciprocal(number):
     return 1 / number
 
 
-@pytest.mark.parametrize("kind", [ThisProcess, lambda: LocalProcesses(2)])
-def test_tasks_come_back_with_their_results_and_errors_as_they_are(kind):
-    executor, done = kind(), []
+@pytest.mark.parametrize("workers", [1, 2])
+def test_tasks_come_back_with_their_results_and_errors_as_they_are(workers):
+    executor = make_executor("local", workers)
     assert run(executor, operator.neg, range(300, 306)) == [-k for k in range(300, 306)]
     assert run(executor, operator.neg, []) == []
-    again = run_in_order(executor, operator.neg, [1, 1, 2, 1], done.append, progress=False)
-    assert (again, done) == ([-1, -1, -2, -1], [0.25, 0.5, 0.75, 1.0])
+    assert run(executor, operator.neg, [1, 1, 2, 1]) == [-1, -1, -2, -1]
     with pytest.raises(ZeroDivisionError):
         run(executor, reciprocal, [1, 0, 2])
 
 
 def test_results_are_in_the_order_of_the_tasks_whichever_is_done_first():
-    second_is_taken = threading.Event()
+    def backwards(work, tasks):
+        yield from list(enumerate(map(work, tasks)))[::-1]
 
-    def work(number):
-        return number if number == 2 else second_is_taken.wait() and number
-
-    with ThreadPoolExecutor(2) as executor:
-        executor.ahead = 2
-        taken = [1, 2], lambda fraction: second_is_taken.set()
-        assert run_in_order(executor, work, *taken, progress=False) == [1, 2]
+    assert run(backwards, operator.neg, [1, 2, 3]) == [-1, -2, -3]
 
 
 def test_a_result_is_handed_over_before_the_next_task_begins_and_the_bar_has_its_size():
-    seen, bar = [], io.StringIO()
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    seen, bar = [], Terminal()
 
     def work(task):
         seen.append(("begun", task))
         return -len(task)
 
     tasks = [range(2), range(3)]
-    run_shown(ThisProcess(), work, tasks, lambda *done: seen.append(done), size=len, file=bar)
+    run_shown(this_process, work, tasks, lambda *done: seen.append(done), size=len, file=bar)
     assert seen == [("begun", range(2)), (0, -2), ("begun", range(3)), (1, -3)]
     assert "5/5" in bar.getvalue()
 
@@ -81,7 +78,7 @@ def interrupted(number):
 
 
 def test_there_are_as_many_processes_as_asked_for_and_they_leave_interrupts_to_this_one(tmp_path):
-    executor = LocalProcesses(2)
+    executor = make_executor("local", 2)
     places = run(executor, meet, [tmp_path] * 8)
     assert {str(place) for place in places} == {each.name for each in tmp_path.iterdir()}
     assert len({*places} - {os.getpid()}) == 2
@@ -103,7 +100,7 @@ def test_processes_have_one_thread_and_do_not_repeat_what_this_one_has_said(monk
     said = threading.Event()
     said.set()
     monkeypatch.setattr("agents.executors.compiling_is_said", said)
-    executor = LocalProcesses(2)
+    executor = make_executor("local", 2)
     assert run(executor, n_warnings, ["dptse_env.config", "torch"]) == [0, 1]
     assert run(executor, is_said, [1]) == [True]
     assert run(executor, os.getenv, ["OMP_NUM_THREADS"]) == ["1"]
@@ -112,30 +109,31 @@ def test_processes_have_one_thread_and_do_not_repeat_what_this_one_has_said(monk
 def test_a_task_whose_worker_died_runs_again_three_times(monkeypatch):
     """With processes in this one, which die as often as they should."""
 
-    class Mortal(ThisProcess):
+    class Mortal:
         deaths = 3
 
-        def __init__(self, *_, **__):
-            pass
+        def submit(self, work, task):
+            future = Future()
+            if self.deaths and task < 0:
+                self.deaths -= 1
+                future.set_exception(loky.BrokenProcessPool())
+            else:
+                future.set_result(work(task))
+            return future
 
-        def submit(self, call):
-            if type(self).deaths:
-                type(self).deaths -= 1
-                raise loky.BrokenProcessPool
-            return super().submit(call)
-
-    monkeypatch.setattr(loky, "ProcessPoolExecutor", Mortal)
-    assert run(LocalProcesses(2), abs, [-1]) == [1]
-    Mortal.deaths = 4
+    pool, executor = Mortal(), make_executor("local", 2)
+    monkeypatch.setattr(loky, "get_reusable_executor", lambda *_, **__: pool)
+    assert run(executor, abs, [1, -2]) == [1, 2]
+    pool.deaths = 4
     with pytest.raises(ExecutorError, match="a task was lost 4 times"):
-        run(LocalProcesses(2), abs, [-1])
-    assert Mortal.deaths == 0
+        run(executor, abs, [1, -2])
+    assert pool.deaths == 0
 
 
 PROGRAM = """
 import sys
-from agents.executors import LocalProcesses, run_in_order
-run_in_order(LocalProcesses(2), exec, sys.argv[1:], progress=False)
+from agents.executors import make_executor, run_in_order
+run_in_order(make_executor("local", 2), exec, sys.argv[1:], progress=False)
 """
 TASK = """
 import os, pathlib, time
@@ -163,8 +161,7 @@ def test_what_still_runs_is_ended_where_another_fails_or_the_program_is_killed(t
 
 
 def test_one_worker_is_the_calling_process():
-    assert isinstance(make_executor("local", 1), ThisProcess)
-    assert make_executor("local", 2).workers == 2
+    assert run(make_executor("local", 1), lambda _: os.getpid(), [0]) == [os.getpid()]
     for workers in (0, 1.5):
         with pytest.raises(ValueError, match="workers must be an integer >= 1"):
             make_executor("local", workers)

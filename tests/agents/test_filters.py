@@ -21,7 +21,7 @@ from dptse_env.estimators.recurrent import read_weights, write_weights  # noqa: 
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE  # noqa: E402
 from dptse_env.evaluation import evaluate  # noqa: E402
 from dptse_env.traffic import RecordLibrary, read_corridor  # noqa: E402
-from tests.agents.elsewhere import Elsewhere  # noqa: E402
+from tests.agents.elsewhere import elsewhere  # noqa: E402
 from tests.estimators.helpers import card  # noqa: E402
 from tests.helpers import SHORT  # noqa: E402
 
@@ -336,7 +336,7 @@ def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_pat
 
     with pytest.raises(KilledError):
         FilterTraining(PLAN, tmp_path, watchers=[kill]).run()
-    resumed = FilterTraining(PLAN, tmp_path, executor=Elsewhere())
+    resumed = FilterTraining(PLAN, tmp_path, executor=elsewhere)
     assert resumed.done == 2
     resumed.run()
     assert_same(resumed, whole)

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("tomlkit")
 
-from agents.executors import THIS_PROCESS
+from agents.executors import this_process
 from agents.fitting import choice as choosing
 from agents.fitting import parameters as searching
 from agents.fitting.choice import Choice
@@ -230,7 +230,7 @@ def test_a_choice_changes_for_what_is_certainly_better(errors, chosen, tmp_path,
         "values",
         lambda rows, labels, metric: np.array(errors[labels["estimator"]], float),
     )
-    choice.choose([{"estimator": name} for name in errors], Place(tmp_path, THIS_PROCESS))
+    choice.choose([{"estimator": name} for name in errors], Place(tmp_path, this_process))
     assert (choice.estimator, choice.rule) == (chosen, "round-robin")
 
 

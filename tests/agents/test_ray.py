@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.executors import ExecutorError, RayCluster, run_in_order
+from agents.executors import ExecutorError, make_executor, run_in_order
 from agents.study import Place, run
 from dptse_env.traffic.library import CACHE_VARIABLE
 from tests.agents.faults import TRACES, rows_of, study
@@ -60,7 +60,7 @@ def read(path):
 
 def test_errors_are_those_of_the_task(cluster, tmp_path):
     cluster.add_node(num_cpus=2)
-    executor = RayCluster(cluster.address)
+    executor = make_executor("ray", 1, cluster.address)
     assert calls(executor, operator.neg, range(20)) == [-k for k in range(20)]
     with pytest.raises(KeyError, match="as it is"):
         calls(executor, raise_type, [KeyError])
@@ -74,7 +74,7 @@ def test_errors_are_those_of_the_task(cluster, tmp_path):
 def test_nodes_make_the_records_that_they_lack(cluster, tmp_path, expected):
     for k in (1, 2):
         cluster.add_node(num_cpus=1, env_vars={CACHE_VARIABLE: str(tmp_path / f"cache-{k}")})
-    run(study(), Place(tmp_path, RayCluster(cluster.address)), progress=False)
+    run(study(), Place(tmp_path, make_executor("ray", 1, cluster.address)), progress=False)
     assert rows_of(tmp_path).equals(expected)
     for k in (1, 2):
         records = (tmp_path / f"cache-{k}").glob("*/*/0*.safetensors")
@@ -83,7 +83,7 @@ def test_nodes_make_the_records_that_they_lack(cluster, tmp_path, expected):
 
 def test_a_killed_worker(cluster, traces, tmp_path, expected):
     add_nodes(cluster, traces, 2)
-    run(study(), Place(tmp_path, RayCluster(cluster.address)), progress=False)
+    run(study(), Place(tmp_path, make_executor("ray", 1, cluster.address)), progress=False)
     assert (traces / "killed").exists()
     assert rows_of(tmp_path).equals(expected)
 
@@ -91,7 +91,7 @@ def test_a_killed_worker(cluster, traces, tmp_path, expected):
 def test_a_removed_node(cluster, traces, tmp_path, expected):
     add_nodes(cluster, traces, 1)
     leaving = cluster.add_node(num_cpus=1, env_vars={TRACES: str(traces)})
-    executor = RayCluster(cluster.address)
+    executor = make_executor("ray", 1, cluster.address)
     job = threading.Thread(target=run, args=(study(), Place(tmp_path, executor), False))
     job.start()
     # Here, as Ray starts and ends nodes in the main thread alone.
@@ -123,6 +123,6 @@ def test_an_address_without_a_cluster_is_an_error(ray, kind):
         else:
             server.socket.close()
         with pytest.raises(ExecutorError, match=f"no Ray cluster answers at {address}:"):
-            RayCluster(address)
+            make_executor("ray", 1, address)
         if kind == "another server":
             server.shutdown()

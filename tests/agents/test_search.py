@@ -6,7 +6,7 @@ import gymnasium as gym
 import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 
-from agents.executors import THIS_PROCESS, LocalProcesses
+from agents.executors import make_executor, this_process
 from agents.search.space import (
     DEMAND_START,
     EXTRAS,
@@ -97,7 +97,7 @@ def made_up(kind=MadeUp, **changes):
     return kind(**fields)
 
 
-def run(folder, n_trials, search=None, executor=THIS_PROCESS):
+def run(folder, n_trials, search=None, executor=this_process):
     return tune(search or made_up(), folder, n_trials, executor)
 
 
@@ -163,7 +163,7 @@ def test_a_search_that_was_interrupted_comes_out_as_one_that_was_not(
 
 @pytest.mark.slow
 def test_several_workers_share_a_journal(tmp_path):
-    study = run(tmp_path, 30, executor=LocalProcesses(2))
+    study = run(tmp_path, 30, executor=make_executor("local", 2))
     assert n_finished(study) == len(study.get_trials()) == 30
     assert len({tuple(t.params.values()) for t in study.get_trials()}) == 30
     assert set(chosen(study)) == {"defaults", "present", "tuned"}

@@ -6,7 +6,7 @@ from dataclasses import replace
 import polars as pl
 import pytest
 
-from agents.executors import THIS_PROCESS, LocalProcesses
+from agents.executors import make_executor, this_process
 from agents.play import Cell, play
 from agents.study import Place, Study, read_rows, run, write_report, write_table
 from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, values
@@ -45,7 +45,7 @@ def small(calls=None, **changes):
 
 def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
     folder = tmp_path / "a[1]"  # as a pattern it does not match itself
-    calls, place = [], Place(folder, THIS_PROCESS)
+    calls, place = [], Place(folder, this_process)
     first = small(calls)
     run(first, place, progress=False)
     rows = read_rows("small", folder).sort("bandwidth", "traffic_seed")
@@ -63,7 +63,7 @@ def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
 
 
 def test_rows_of_equal_numbers_count_as_played_and_others_do_not(tmp_path, monkeypatch):
-    place, first = Place(tmp_path, THIS_PROCESS), small()
+    place, first = Place(tmp_path, this_process), small()
     run(first, place, progress=False)
     rows, own = rows_of(tmp_path), versions.code_version()
     old = rows.with_columns(version=pl.lit("0.1.0"), rmse_density=pl.lit(7.0))
@@ -93,7 +93,7 @@ def test_cells_may_follow_from_rows(tmp_path):
         keywords = {**KEYWORDS, "bandwidth": chosen}
         return [Cell(SHORT, "static", keywords, {"bandwidth": 10 + chosen}, seeds=(2005,))]
 
-    run(small(follow=follow), Place(tmp_path, THIS_PROCESS), progress=False)
+    run(small(follow=follow), Place(tmp_path, this_process), progress=False)
     assert rows_of(tmp_path)["bandwidth"].to_list()[-1] == 12
     assert rows_of(tmp_path)["traffic_seed"].to_list()[-1] == 2005
 
@@ -107,11 +107,11 @@ def test_bad_cells_are_refused_before_the_first_is_played(tmp_path):
         (replace(good, keywords={"cargo": 1}), "cargo"),
     ]:
         with pytest.raises(ValueError, match=message):
-            run(small(cells=(good, bad)), Place(tmp_path, THIS_PROCESS), progress=False)
+            run(small(cells=(good, bad)), Place(tmp_path, this_process), progress=False)
         assert not (tmp_path / "rows").exists()
     bad = replace(good, labels={"reward": 1})
     with pytest.raises(ValueError, match=r"labels must differ .* got 'reward'"):
-        run(small(cells=(bad,)), Place(tmp_path, THIS_PROCESS), progress=False)
+        run(small(cells=(bad,)), Place(tmp_path, this_process), progress=False)
 
 
 def test_broken_tables_and_those_of_another_study_are_refused(tmp_path):
@@ -183,7 +183,7 @@ def test_pairs_are_of_equal_numbers(monkeypatch):
 
 @pytest.mark.slow
 def test_a_killed_worker_loses_nothing(tmp_path, traces, expected):
-    run(study(), Place(tmp_path, LocalProcesses(2)), progress=False)
+    run(study(), Place(tmp_path, make_executor("local", 2)), progress=False)
     assert (traces / "killed").exists()
     assert rows_of(tmp_path).equals(expected)
 
@@ -192,7 +192,7 @@ def test_a_killed_worker_loses_nothing(tmp_path, traces, expected):
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows kills otherwise")
 def test_a_killed_program_goes_on(tmp_path, expected):
     words = "tests.agents.faults", tmp_path
-    assert run_killed("agents.executors:tqdm", "update", 2, *words).returncode == -9
+    assert run_killed("dptse_env.utils.progress:tqdm", "update", 2, *words).returncode == -9
     assert len(list((tmp_path / "rows").glob("*.parquet"))) == 2
-    assert run_killed("agents.executors:tqdm", "update", 5, *words).returncode == 0
+    assert run_killed("dptse_env.utils.progress:tqdm", "update", 5, *words).returncode == 0
     assert rows_of(tmp_path).equals(expected)

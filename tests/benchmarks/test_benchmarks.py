@@ -4,11 +4,11 @@ import json
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from agents.executors import ThisProcess
 from benchmarks import __main__ as benchmarks
 from benchmarks import long_roads
 from benchmarks.turns import Line, compare, take_turns
@@ -53,7 +53,7 @@ def test_a_part_that_fails_loses_nothing_of_the_others(tmp_path, monkeypatch, ca
         return [Line(f"a step of {part}", 1.0)] if part != "environment" else {}[part]
 
     monkeypatch.setattr(benchmarks, "measure", measure)
-    monkeypatch.setattr(benchmarks, "ProcessPoolExecutor", lambda *_: ThisProcess())
+    monkeypatch.setattr(benchmarks, "ProcessPoolExecutor", lambda *_: ThreadPoolExecutor(1))
     path = tmp_path / "new" / "tables.md"
     with pytest.raises(SystemExit, match=r"environment failed"):
         benchmarks.main(benchmarks.Args(output=path))

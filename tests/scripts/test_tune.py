@@ -37,11 +37,11 @@ def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
         "--trials", "16", "--workers", "2", "--output", tmp_path,
     )  # fmt: skip
     journal = tmp_path / "ekf-published-printed.journal"
-    assert run_killed("agents.executors:tqdm", "update", 4, *words).returncode == -9
+    assert run_killed("dptse_env.utils.progress:tqdm", "update", 4, *words).returncode == -9
     n = finished(journal)
     assert 4 <= n < 16
     assert not (tmp_path / "ekf-published-printed.json").exists()
-    assert run_killed("agents.executors:tqdm", "update", 17 - n, *words).returncode == 0
+    assert run_killed("dptse_env.utils.progress:tqdm", "update", 17 - n, *words).returncode == 0
     (content,) = json.loads((tmp_path / "ekf-published-printed.json").read_text()).values()
     assert content["provenance"]["n_trials"] == finished(journal) == 16
 

@@ -14,7 +14,7 @@ from dptse_env.parts import privacy_report
 from dptse_env.privacy import ROUNDING, epsilon_of
 from dptse_env.release import Capped, CappedSettings, ReleaseModel
 from dptse_env.release.noise import grid_of
-from tests.agents.elsewhere import Elsewhere
+from tests.agents.elsewhere import elsewhere
 
 from .mechanisms import MECHANISMS
 from .small import HORIZON, ROAD, config, paced, runs_of, staying
@@ -152,7 +152,7 @@ def test_runs_depend_on_their_seed_alone(setting, record):
     """Not on how many are played at once, nor where."""
     worlds = Planner(setting).choose(record, "replaced")
     together = runs_of(setting, worlds, 5, seed=3)
-    for options in ({"batch": 2}, {"batch": 3, "executor": Elsewhere()}):
+    for options in ({"batch": 2}, {"batch": 3, "executor": elsewhere}):
         parts = runs_of(setting, worlds, 5, seed=3, **options)
         np.testing.assert_array_equal(together.scores, parts.scores)
         np.testing.assert_array_equal(together.distances, parts.distances)

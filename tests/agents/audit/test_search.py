@@ -10,7 +10,7 @@ from agents.audit.attack import attack
 from agents.audit.search import Mutations, climb
 from dptse_env.parts import privacy_report
 from dptse_env.release import Paced
-from tests.agents.elsewhere import Elsewhere
+from tests.agents.elsewhere import elsewhere
 
 from .small import HalfTheLimit, config, paced
 
@@ -80,7 +80,7 @@ def test_mutations_keep_to_the_bandwidth_and_to_what_is_protected(setting):
 def test_a_search_depends_on_its_seed_alone(record, monkeypatch):
     monkeypatch.setattr(search, "CLIMBERS", 3)
     setting, found = paced("ekf"), []
-    for options in ({}, {"executor": Elsewhere()}, {"seed": 1}):
+    for options in ({}, {"executor": elsewhere}, {"seed": 1}):
         worlds, plan = climb(setting, record, 2, **options)
         found.append((worlds.trajectories[0].speed, plan))
     for one, other in zip(found[0], found[1], strict=True):

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from agents.executors import THIS_PROCESS
+from agents.executors import this_process
 from agents.play import corridor_of
 from agents.studies import estimators as study
 from agents.studies.estimators import STUDY, sensed
@@ -105,7 +105,7 @@ def test_it_plays_and_reports(tmp_path):
     found = (study.world_cell("ShortHighway-v0", name) for name in study.MOVED[:2])
     cells = [replace(each, keywords={**each.keywords, "horizon": 90}, seeds=None) for each in found]
     small = replace(STUDY, cells=tuple(cells), seeds=(2000, 2001))
-    run(small, Place(tmp_path, THIS_PROCESS), progress=False)
+    run(small, Place(tmp_path, this_process), progress=False)
     rows = read_rows("estimators", tmp_path)
     assert len(rows) == 4
     squares, n = (

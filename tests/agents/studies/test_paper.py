@@ -5,7 +5,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from agents.executors import THIS_PROCESS
+from agents.executors import this_process
 from agents.statistics import Interval
 from agents.studies import paper
 from agents.studies.paper import CELLS, SETTINGS, STUDY, by_cell, judge, tables_of
@@ -99,7 +99,7 @@ def test_two_cells_are_played_measured_and_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(paper, "N_TIMED", 2)
     base = [paper.labels_of("random_walk", setting) for setting in (first, second)]
     cells = tuple(cell for cell in CELLS if cell.labels in base)
-    place = Place(tmp_path, THIS_PROCESS)
+    place = Place(tmp_path, this_process)
     run(replace(STUDY, cells=cells, seeds=(2000, 2001)), place, progress=False)
     text = (tmp_path / "tables.md").read_text("utf-8")
     assert ["[" in each for each in entries(text, "random walk")] == [True, True, False, False]

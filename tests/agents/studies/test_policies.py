@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from agents.executors import THIS_PROCESS
+from agents.executors import this_process
 from agents.statistics import bootstrap, percent_below, percent_of_way
 from agents.studies import policies
 from agents.studies.policies import GAIN, ORACLE, ROUND_ROBIN, RULES, STARTED, TEST, VALIDATION
@@ -171,7 +171,7 @@ def test_traffic_of_trainings_choices_and_tests_is_apart():
 
 
 def test_policies_of_the_package_suit_their_settings(tmp_path):
-    cells = policies.test_cells(pl.DataFrame(), Place(tmp_path, THIS_PROCESS))
+    cells = policies.test_cells(pl.DataFrame(), Place(tmp_path, this_process))
     found = {cell.labels["setting"]: cell for cell in cells if cell.transferred}
     assert {name: cell.policy for name, cell in found.items()} == policies.SHIPPED
     assert set(policies.SHIPPED.values()) < set(shipped_policies())
@@ -226,7 +226,7 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(policies, "SHIPPED", {})
     cells = tuple(policies._cell("short", rule, VALIDATION) for rule in (ROUND_ROBIN, OTHER))
     monkeypatch.setattr(policies, "STUDY", replace(policies.STUDY, cells=cells))
-    place = Place(tmp_path, THIS_PROCESS)
+    place = Place(tmp_path, this_process)
     validated = play_study(policies.STUDY, place)
     train_ladder(validated, place, 0.05, (0,))
     curves = read_table(tmp_path / policies.CURVES)

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from agents import tables
-from agents.executors import THIS_PROCESS
+from agents.executors import this_process
 from agents.play import Cell
 from agents.seeds import SUITE
 from agents.studies import suite
@@ -45,7 +45,7 @@ def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded")
     cells = [dataclasses.replace(each, policy=policy, labels={"name": name, "policy": policy})
              for name, each in SMALL.items() for policy in ("static", ZERO, ONE)]  # fmt: skip
-    play_study(Study("suite", tuple(cells), (), report), Place(folder, THIS_PROCESS), False)
+    play_study(Study("suite", tuple(cells), (), report), Place(folder, this_process), False)
     return folder
 
 

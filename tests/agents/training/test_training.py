@@ -5,7 +5,6 @@ import multiprocessing
 import shutil
 import signal
 import sys
-from concurrent.futures import Future
 from itertools import count
 from pathlib import Path
 
@@ -19,7 +18,7 @@ import torch
 from PIL import Image
 
 from agents.environments import make_vector
-from agents.executors import THIS_PROCESS, ExecutorError, ThisProcess
+from agents.executors import ExecutorError, this_process
 from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
 from agents.training.run import BEST, CURVE, POLICY, RULES, RULES_FILE, Run, silent
@@ -29,7 +28,7 @@ from agents.training.training import train, train_all
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import ReplicaBaseline, load_policy
 from dptse_env.utils.files import read_tensors
-from tests.agents.elsewhere import Elsewhere
+from tests.agents.elsewhere import elsewhere
 from tests.agents.training.plans import (
     ENV,
     SMALL,
@@ -361,7 +360,7 @@ def test_trainings_at_once_come_out_as_alone(whole, tmp_path):
         train(make_plan(seed=2), tmp_path / "2", watchers=(stop_at(1),))
     rows = read_progress(tmp_path / "2")
     plans = {tmp_path / str(seed): make_plan(seed=seed) for seed in (1, 2)}
-    train_all(plans, Elsewhere(), progress=False)
+    train_all(plans, elsewhere, progress=False)
     assert_alike(tmp_path / "1", whole()[0])
     assert read_progress(tmp_path / "2")[: len(rows)] == rows
     first, second = (read_checkpoint(folder)["policy"] for folder in plans)
@@ -371,21 +370,17 @@ def test_trainings_at_once_come_out_as_alone(whole, tmp_path):
 def test_a_folder_of_another_plan_is_refused_before_anything_runs(whole, tmp_path):
     plans = {tmp_path / "9": make_plan(), whole()[0]: make_plan(seed=9)}
     with pytest.raises(ValueError, match="seed is 1 there and 9 now"):
-        train_all(plans, THIS_PROCESS, progress=False)
+        train_all(plans, this_process, progress=False)
     assert not (tmp_path / "9").exists()
 
 
 def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
-    class Apart(ThisProcess):
-        """Trains on the disk of another machine."""
-
-        def submit(self, fn, /, *args, **kwargs):
-            future = Future()
-            future.set_result(None)
-            return future
+    def apart(work, tasks):
+        """Train on the disk of another machine."""
+        yield 0, None
 
     with pytest.raises(ExecutorError, match="choose an --output that all nodes have"):
-        train_all({tmp_path / "0": make_plan()}, Apart(), progress=False)
+        train_all({tmp_path / "0": make_plan()}, apart, progress=False)
 
 
 # --- non-interference; see `tests.test_non_interference` ------------------------------------------
