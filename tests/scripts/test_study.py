@@ -5,7 +5,7 @@ from dataclasses import replace
 import polars as pl
 import pytest
 
-from agents.executors import THIS_PROCESS
+from agents.executors import this_process
 from agents.study import Place, read_rows
 from examples.my_study import STUDY
 from scripts.study import STUDIES, Args, find_study, main
@@ -94,7 +94,7 @@ def test_seeds_and_environments_can_be_others_with_an_output_of_their_own():
 
 def test_choices_keep_their_validation_traffic_on_other_seeds(tmp_path):
     study = find_study(Args(name="policies", test_seeds="2900:2902", quick=True))
-    cells = [*study.cells, *study.follow(pl.DataFrame(), Place(tmp_path, THIS_PROCESS))]
+    cells = [*study.cells, *study.follow(pl.DataFrame(), Place(tmp_path, this_process))]
     seeds = {cell.labels["part"]: study.seeds_of(cell) for cell in cells}
     assert seeds == {"validation": (1000, 1001, 1002), "test": (2900, 2901)}
 

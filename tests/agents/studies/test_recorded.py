@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.executors import THIS_PROCESS
+from agents.executors import this_process
 from agents.study import Place, read_rows, write_report
 
 RESULTS = Path(__file__).parents[3] / "results"
@@ -26,7 +26,7 @@ def study(name):
 def test_every_cell_was_played(name, tmp_path):
     rows = read_rows(name, RESULTS / name)
     follow = study(name).follow
-    cells = [*study(name).cells, *(follow(rows, Place(tmp_path, THIS_PROCESS)) if follow else ())]
+    cells = [*study(name).cells, *(follow(rows, Place(tmp_path, this_process)) if follow else ())]
     played = dict(rows.group_by("cell").agg("traffic_seed").iter_rows())
     assert all(set(study(name).seeds_of(cell)) <= set(played[cell.id]) for cell in cells)
     for file in tmp_path.iterdir():
