@@ -19,8 +19,9 @@ PACKAGES = {
     "results/suite/rows.parquet": "dptse_env/_tools/results/suite/rows.parquet",
 }
 """Folders and files of the repository that are in a wheel, and where."""
-IN_A_WHEEL = {"", ".json", ".parquet", ".py", ".safetensors", ".txt", ".typed", ".xml"}
-"""Kinds of files of the packages: code, settings, weights, SUMO nets, rows, policies, digests."""
+IN_A_WHEEL = {"", ".json", ".parquet", ".py", ".safetensors", ".toml", ".txt", ".typed", ".xml"}
+"""Kinds of files of the packages: code, settings, weights, SUMO nets, rows, policies, roads,
+digests."""
 
 FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}
 """Folders of a source archive."""
@@ -30,7 +31,7 @@ BESIDE_THEM = {
     "pyproject.toml", "zensical.toml",
 }  # fmt: skip
 IN_A_SOURCE_ARCHIVE = IN_A_WHEEL | {
-    ".css", ".gif", ".ipynb", ".md", ".npz", ".png", ".toml", ".yaml", ".yml"
+    ".css", ".gif", ".ipynb", ".md", ".npz", ".png", ".yaml", ".yml"
 }  # fmt: skip
 
 LARGEST = 4_000_000

@@ -1,4 +1,4 @@
-"""Estimators on roads that nobody trained on: own roads, sections of longer ones, other simulators.
+"""Estimators on roads that nobody trained on: own roads, and sections of longer ones.
 
 Every vehicle answers queries, which go round robin. The filters have the parameters and settings
 that were calibrated for PrivateHighway-v1. Weights other than those of the package are given with
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import tomllib
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
@@ -24,8 +25,7 @@ from matplotlib.figure import Figure
 from agents.figures import LABELS, draw_errors, save_measured
 from agents.play import Cell
 from agents.statistics import Interval
-from agents.studies.roads.own import KEPT_BACK, OWN_ROADS
-from agents.studies.roads.recorded import IDM_SEEDS, QUEUES
+from agents.studies.roads.recorded import QUEUES
 from agents.study import Study
 from agents.tables import (
     DENSITY,
@@ -87,27 +87,36 @@ class Road(NamedTuple):
     releases: Sequence[str] = (PACED, CORRECTED)
 
 
-def _recorded(road: str, seeds: tuple[int, ...], bandwidth: int) -> _Part:
-    """Return a part of the road that `agents.studies.roads.recorded` has by a name."""
-    corridor = f"agents.studies.roads.recorded:{road}"
-    return {"corridor": corridor, "bandwidth": bandwidth, "traffic_seeds": seeds}, seeds
+def _section(number: int) -> _Part:
+    """Return a section as a part; `agents.studies.roads.recorded` has its road."""
+    corridor = f"agents.studies.roads.recorded:section_{number}"
+    return {"corridor": corridor, "bandwidth": 3, "traffic_seeds": (number,)}, (number,)
 
 
+def _own_roads() -> dict[str, dict[str, Any]]:
+    """Return the keywords of the own roads; TOML has no null for a road without incidents."""
+    roads = tomllib.loads(Path(__file__).with_name("own.toml").read_text(encoding="utf-8"))
+    for road in roads.values():
+        if road["corridor"].get("incident") == "none":
+            road["corridor"]["incident"] = None
+    return roads
+
+
+_OWN_ROADS = _own_roads()
+KEPT_BACK = [name for name, keywords in _OWN_ROADS.items() if keywords.pop("kept_back", False)]
+"""Roads on which nothing was chosen."""
 _CALIBRATED = {"parameters": "w99-3lane"}
 OTHERS: dict[str, Road] = {
     **{
-        f"sections, {queue}": Road(
-            PRIVATE, [_recorded(f"section_{each}", (each,), bandwidth=3) for each in numbers]
-        )
+        f"sections, {queue}": Road(PRIVATE, [*map(_section, numbers)])
         for queue, numbers in QUEUES.items()
     },
-    "another simulator": Road(PRIVATE, [_recorded("idm", IDM_SEEDS, bandwidth=2)]),
     "PrivateHighway-v1": Road(PRIVATE, [({}, MORE_SEEDS)]),
     "PaperHighway-v0": Road(PAPER, [(_CALIBRATED, MORE_SEEDS)], ("printed", CORRECTED)),
     "LongHighway-v0": Road(LONG, [({}, SEEDS)], (PACED,)),
 }
 """Beside the own roads: recorded ones, and those that weights are trained on."""
-OWN = {name: Road(PRIVATE, [(keywords, SEEDS)]) for name, keywords in OWN_ROADS.items()}
+OWN = {name: Road(PRIVATE, [(keywords, SEEDS)]) for name, keywords in _OWN_ROADS.items()}
 ROADS = {**OWN, **OTHERS}
 
 

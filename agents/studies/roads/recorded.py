@@ -1,7 +1,6 @@
-"""Roads with recordings that are made when they are first used, in the user's cache.
+"""Sections of highways, recorded in the user's cache when they are first used.
 
-A configuration names them by this module: ``"agents.studies.roads.recorded:idm"`` is the road of
-the other simulator, ``"agents.studies.roads.recorded:section_10003"`` the section of a highway.
+A configuration names them by this module, as ``"agents.studies.roads.recorded:section_10003"``.
 """
 
 from __future__ import annotations
@@ -15,29 +14,11 @@ from filelock import FileLock
 
 from agents.filters import highways
 from agents.filters.highways import SLOW, Section
-from agents.studies.roads import idm as simulator
 from dptse_env.importers.folder import ROAD, new_folder
-from dptse_env.importers.measured import measure
 from dptse_env.traffic import Corridor, Record, RecordLibrary, read_corridor, write_corridor
 from dptse_env.traffic.imported import load_record, save_records
 from dptse_env.traffic.library import CACHE_VARIABLE, default_path
 from dptse_env.utils.files import file_digest, require_writable
-
-IDM_SEEDS = tuple(range(2000, 2016))
-
-
-def idm() -> Corridor:
-    """Return the road of the other simulator, with `IDM_SEEDS`."""
-
-    def write(folder: Path) -> None:
-        records = [simulator.simulate(seed) for seed in IDM_SEEDS]
-        road = measure(simulator.road(), lambda: records)
-        sources = [{"seed": seed} for seed in IDM_SEEDS]
-        kept = save_records(folder, road, records, sources)
-        write_corridor(folder / ROAD, road.replaced(recordings=kept))
-
-    return _made_once(f"idm-{file_digest(simulator.__file__)[:16]}", write)
-
 
 QUEUES: dict[str, tuple[int, ...]] = {
     "queue through the end": (
@@ -68,16 +49,25 @@ def __getattr__(name: str) -> Callable[[], Corridor]:
 
 def section(number: int) -> Corridor:
     """Return a section of a highway, whose record has the highway's number as its traffic seed."""
+    name = f"section-{number}-{file_digest(highways.__file__)[:16]}"
+    folder = default_path() / "roads" / name
+    if not folder.exists():
+        require_writable(CACHE_VARIABLE, default_path())
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder.parent / f".{name}.lock"):
+            if not folder.exists():
+                with new_folder(folder) as empty:
+                    _write_section(number, empty)
+    return read_corridor(folder / ROAD)
 
-    def write(folder: Path) -> None:
-        with tempfile.TemporaryDirectory() as work:
-            cut = Section(number, SEGMENTS, windows=1, seconds=SECONDS)
-            road = read_corridor(cut.write(Path(work), RecordLibrary()))
-            record = load_record(road, 0)
-        kept = save_records(folder, road, [record], [{"seed": number}])
-        write_corridor(folder / ROAD, road.replaced(recordings=kept))
 
-    return _made_once(f"section-{number}-{file_digest(highways.__file__)[:16]}", write)
+def _write_section(number: int, folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as work:
+        cut = Section(number, SEGMENTS, windows=1, seconds=SECONDS)
+        road = read_corridor(cut.write(Path(work), RecordLibrary()))
+        record = load_record(road, 0)
+    kept = save_records(folder, road, [record], [{"seed": number}])
+    write_corridor(folder / ROAD, road.replaced(recordings=kept))
 
 
 def queue_of(road: Corridor, record: Record) -> str | None:
@@ -90,16 +80,3 @@ def queue_of(road: Corridor, record: Record) -> str | None:
     if mainline.max() > QUEUED and end < RARELY:
         return "queue inside"
     return "no queue" if max(*mainline, start, end) < RARELY else None
-
-
-def _made_once(name: str, write: Callable[[Path], None]) -> Corridor:
-    """Return the road of a folder in the cache, which is written if it is not there."""
-    folder = default_path() / "roads" / name
-    if not folder.exists():
-        require_writable(CACHE_VARIABLE, default_path())
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder.parent / f".{name}.lock"):
-            if not folder.exists():
-                with new_folder(folder) as empty:
-                    write(empty)
-    return read_corridor(folder / ROAD)

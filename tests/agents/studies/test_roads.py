@@ -6,11 +6,12 @@ import pytest
 
 from agents.environments import make_config, quietly
 from agents.studies import roads
-from agents.studies.roads import idm, on_road, recorded
+from agents.studies.roads import on_road, recorded
 from agents.study import read_rows
 from agents.tables import pick
 from dptse_env.estimators import recurrent
-from dptse_env.traffic import CORRIDORS, Record
+from dptse_env.importers.folder import ROAD
+from dptse_env.traffic import CORRIDORS, Record, write_corridor
 from dptse_env.traffic.imported import load_record
 
 RECORDED = Path(__file__).parents[3] / "results" / "roads"
@@ -22,22 +23,18 @@ def rows():
     return read_rows("roads", RECORDED)
 
 
-@pytest.fixture
-def short(monkeypatch):
-    """Make the other simulator's records short."""
-    monkeypatch.setattr(idm, "WARM_UP", 100)
-    monkeypatch.setattr(idm, "DURATION", 60)
-
-
 def test_own_roads_are_others_and_their_filters_are_calibrated():
     with quietly():
-        configs = {name: make_config(roads.PRIVATE, own) for name, own in roads.OWN_ROADS.items()}
+        configs = {
+            name: make_config(road.env, road.parts[0][0]) for name, road in roads.OWN.items()
+        }
     digests = {config.corridor.digest for config in configs.values()}
     assert len(digests) == 14
     assert make_config(roads.PRIVATE, {}).corridor.digest not in digests
     assert {config.settings_name for config in configs.values()} == {"ekf-w99-3lane-paced"}
     assert configs["two lanes, 80 km/h"].corridor.scales.density_scale == pytest.approx(222.0)
-    assert set(roads.KEPT_BACK) < set(roads.OWN)
+    assert configs["night, 300 veh/h"].corridor.conditions.incident is None
+    assert len(roads.KEPT_BACK) == 4
 
 
 def test_all_roads_are_played():
@@ -94,38 +91,10 @@ def test_the_summary_is_the_mean_over_own_roads_that_were_played(rows):
     assert "over 1 own roads" in said
 
 
-@pytest.mark.usefixtures("short")
-def test_vehicles_of_the_other_simulator_drive_downstream_segment_by_segment():
-    record = idm.simulate(3)
-    assert record.digest == idm.simulate(3).digest != idm.simulate(4).digest
-    place = np.array([*range(1, idm.N + 1), 0, idm.N + 1])[record.segment]
-    order = np.lexsort((record.step, record.vehicle))
-    vehicle, step = record.vehicle[order], record.step[order]
-    same = np.diff(vehicle) == 0
-    moved = np.diff(place[order])[same]
-    assert set(np.diff(step)[same]) == {1}
-    assert set(moved) == {0, 1}
-    assert 20.0 < record.speed.mean() < 1.2 * idm.LIMIT
-    assert (record.counts[:, : idm.N].sum(axis=1) > 10).all()
-
-
-def test_nobody_drives_through_a_leader_that_stands():
-    rng = np.random.default_rng(0)
-    n = 20
-    cars = np.zeros((6, n))
-    cars[0] = np.arange(n) * 40.0
-    cars[1, :-1], cars[2], cars[3], cars[5] = 29.0, 29.0, 1.0, np.arange(n)
-    cars[2, -1] = 1e-3  # which does not want to move
-    for _ in range(400):
-        idm.drive(cars, 1.0, rng)
-        assert (np.diff(cars[0]) > idm.VEHICLE - 1e-9).all()
-    assert cars[1].max() < 5.0
-    assert np.diff(cars[0]).max() < 15.0
-
-
 def test_a_queue_through_the_end_is_told_from_one_inside():
-    road = idm.road()
-    speeds = np.full((40, idm.N + 2), 90.0)
+    road = CORRIDORS.find("paper-highway")
+    last, end = road.geometry.n_mainline - 1, road.geometry.n_segments + 1
+    speeds = np.full((40, len(road.road.lengths)), 90.0)
 
     def queue(*columns):
         slow = speeds.copy()
@@ -136,8 +105,7 @@ def test_a_queue_through_the_end_is_told_from_one_inside():
         n_steps, n_columns = speeds.shape
         return Record(n_steps=n_steps, n_columns=n_columns, field=np.stack(both, axis=-1))
 
-    end = idm.N + 1
-    assert queue(idm.N - 1, end) == "queue through the end"
+    assert queue(last, end) == "queue through the end"
     assert queue(4, 5) == "queue inside"
     assert queue() == "no queue"
     assert queue(end) is queue(4, end) is None  # not on the section's last segment
@@ -151,23 +119,20 @@ def test_sections_are_as_they_are_called():
         assert recorded.queue_of(road, record) == queue
 
 
-@pytest.mark.usefixtures("short")
-def test_a_recorded_road_is_made_once_in_one_piece(tmp_path, monkeypatch):
+def test_a_section_is_made_once_in_one_piece(tmp_path, monkeypatch):
+    written = []
+
+    def write(number, folder):
+        written.append(number)
+        write_corridor(folder / ROAD, CORRIDORS.find("short-highway"))
+        if len(written) == 1:
+            raise KeyboardInterrupt
+
     monkeypatch.setenv("DPTSE_CACHE", str(tmp_path))
-    monkeypatch.setattr(recorded, "IDM_SEEDS", (2000,))
-    simulate = idm.simulate
-
-    def fail(seed):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(idm, "simulate", fail)
+    monkeypatch.setattr(recorded, "_write_section", write)
+    make = CORRIDORS.find("agents.studies.roads.recorded:section_7")
     with pytest.raises(KeyboardInterrupt):
-        CORRIDORS.find("agents.studies.roads.recorded:idm")()
-    assert not list(tmp_path.glob("roads/idm*"))
-    monkeypatch.setattr(idm, "simulate", simulate)
-    road = CORRIDORS.find("agents.studies.roads.recorded:idm")()
-    monkeypatch.setattr(idm, "simulate", fail)
-    assert CORRIDORS.find("agents.studies.roads.recorded:idm")() == road
-    keywords = {"corridor": road, "traffic_seeds": [2000]}
-    with quietly():
-        assert make_config(roads.PRIVATE, keywords).corridor.recordings == road.recordings
+        make()
+    assert not list(tmp_path.glob("roads/section*"))
+    assert make() == make()
+    assert written == [7, 7]
