@@ -613,7 +613,7 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
     warnings.warn(
         f"{', '.join(inherited)}: values measured or tuned on {base.corridor.name}, or assumed, "
         "are used on another road or with other parameters; `dptse fit` fits parameters to a road "
-        "file, `dptse tune` tunes settings",
+        "file, `dptse fit --tune` tunes settings",
         UserWarning,
         stacklevel=1,  # one place, so that Python tells it once, however environments are made
     )

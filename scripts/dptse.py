@@ -20,7 +20,7 @@ GROUPS = {
     "bring your own": {
         "import": "import trajectories, nets, fields, policies",
         "record": "record traffic with SUMO ahead of time",
-        "fit": "fit parameters, estimator and rule to a road",
+        "fit": "fit parameters, estimator and policy to a road",
     },
     "study": {
         "study": "run a study and write its report",
@@ -43,7 +43,15 @@ GONE = {
 RENAMED: dict[str, dict[str, str]] = {
     "audit": {},
     "evaluate": {},
-    "fit": {},
+    "fit": {
+        "--training": "--train-seeds",
+        "--validation": "--validation-seeds",
+        "--test": "--test-seeds",
+        "--tries": "--trials",
+        "--rules": "--policies",
+        "--seeds": "--train-seeds",
+        "--schedule": "--policies",
+    },
     "import": {},
     "info": {"--mu": "dptse_env.privacy.over_trips, a function,"},
     "record": {"--seeds": "--train-seeds, --validation-seeds or --test-seeds"},

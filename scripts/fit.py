@@ -1,19 +1,20 @@
-r"""Fit parameters, estimator and query rule to a road, and write them into its file.
+r"""Fit parameters, estimator and query policy to a road, and write them into its file.
 
 dptse fit my-road.toml
 
 It records traffic that is missing, fits ARZ parameters by the filter's error on training traffic,
-chooses parameters, estimator and query rule on validation traffic, and plays them once on test
-traffic. The folder my-road-fit gets page.html, which says what to do next. The same command goes on
-after Ctrl-C.
+chooses parameters, estimator and query policy on validation traffic, and plays them once on test
+traffic. The folder my-road-fit gets page.html, which says what to do next. With --tune it searches
+settings of estimators on training traffic instead, for the road or, without one, for --env, and
+writes a file for the keyword estimator_settings for each. The same command goes on after Ctrl-C.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shlex
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -22,100 +23,200 @@ from typing import Any
 from tyro.conf import Positional
 
 from agents.environments import make_config, parse_env, quietly
+from agents.executors import make_executor
 from agents.fitting.choice import (
     ESTIMATORS_TRIED,
     FILTER,
+    POLICIES_TRIED,
     PRESENT,
     ROUND_ROBIN,
-    RULES_TRIED,
     Choice,
 )
-from agents.fitting.page import Outcome, answer, write
+from agents.fitting.page import Outcome, verdict, write
 from agents.fitting.parameters import Fit, fit_parameters, is_stable, start_from, traffic_of
-from agents.fitting.road import PLAYED, Road, find_road
+from agents.fitting.road import PLAYED, Road, find_road, require_road, seeds_of
 from agents.fitting.road_file import copy_of, write_choice
-from agents.play import record
+from agents.search.space import SPACE, Extra
+from agents.search.tuning import Search, chosen, tune, write_set
+from agents.seeds import KINDS
 from agents.study import Place
 from agents.tables import ERROR, Labels, values
+from agents.terminal import make_table
 from dptse_env.estimators import check_estimator
 from dptse_env.estimators.tuned import DEFAULT_PARAMETERS, tuned_with
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
 from dptse_env.model.parameters import read_parameters, write_parameters
-from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import RecordLibrary, ranges
 from dptse_env.traffic.roads import from_home
 from dptse_env.utils.files import replacing, require_output, write_atomically
 from dptse_env.utils.validation import integer, require
 from dptse_env.versions import code_version
-from scripts.cli import Machines
+from scripts.cli import (
+    Command,
+    Environment,
+    Estimators,
+    Machines,
+    Policies,
+    Seed,
+    TestSeeds,
+    TrainSeeds,
+    ValidationSeeds,
+)
 
-PAGE, STAGES, SEARCH = "page.html", "stages", "search.json"
+PAGE, STAGES, SEARCH, JOURNAL = "page.html", "stages", "search.json", "trials.journal"
 STEPS = (
     "record traffic", "fit ARZ parameters", "choose parameters", "choose an estimator",
-    "choose a query rule", "evaluate on test traffic",
+    "choose a query policy", "evaluate on test traffic",
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Args(Machines):
+@dataclass(frozen=True, kw_only=True)
+class Args(
+    Command,
+    Environment,
+    TrainSeeds,
+    ValidationSeeds,
+    TestSeeds,
+    Estimators,
+    Policies,
+    Seed,
+    Machines,
+):
     """Fit a road."""
 
-    road: Positional[Path] = Path("my-road.toml")
+    road: Positional[Path | None] = None
     """Road file, of a road of your own, an import or a SUMO network."""
     env: str = "dptse_env:dptse/PrivateHighway-v1"
-    """Environment to fit for: an id, or an id and keywords as JSON, 'ID {"bandwidth": 3}'."""
-    training: str | None = None
-    """Traffic seeds to fit on, first:stop; 0:8, or all training windows of an import."""
-    validation: str | None = None
-    """Traffic seeds to choose on; 1000:1008, or all validation windows."""
-    test: str | None = None
-    """Traffic seeds to evaluate on; 2000:2016, or all test windows."""
-    tries: int = 60
-    """Sets of ARZ parameters to try."""
-    estimators: tuple[str, ...] = ESTIMATORS_TRIED
-    """Estimators to choose from."""
-    rules: tuple[str, ...] = RULES_TRIED
-    """Query rules to choose from."""
+    trials: int = 60
+    """Sets of ARZ parameters, or of settings, to try."""
+    estimators: tuple[str, ...] = ()
+    """Estimators to choose from, or to tune; all suitable ones if none."""
+    policies: tuple[str, ...] = ()
+    """Query policies to choose from; with --tune the one that is played."""
     keep_fitted: bool = False
-    """Write the fitted parameters even where they do not lower the filter's error."""
+    """Write fitted parameters even if they are no better."""
     output: Path | None = None
-    """Folder of the fit; NAME-fit beside NAME.toml if not given."""
-    json: bool = False
-    """Print JSON, for a program, in place of text."""
+    """Folder of the results; NAME-fit beside NAME.toml if not given."""
+    tune: bool = False
+    """Tune settings instead."""
+    also: tuple[Extra, ...] = ()
+    """Further settings to tune; 'demand' are demand states with their noise."""
+    force: bool = False
+    """Replace tuned sets that have no trials."""
+
+
+OF_FIT = "validation_seeds", "test_seeds", "keep_fitted", "executor", "address"
+OF_TUNE = "also", "seed", "force"
 
 
 def main(args: Args) -> None:
-    """Fit, choose, evaluate, and write the page and the road file."""
-    integer("tries", args.tries, 1)
-    for estimator in args.estimators:
-        check_estimator(estimator, "compiled")
-    for rule in args.rules:
-        SCHEDULES.find(rule)
-    require(bool(args.estimators and args.rules), "estimators and rules", "not empty", "none")
-    folder = args.output or args.road.with_name(f"{args.road.stem}-fit")
-    seeds = {"training": args.training, "validation": args.validation, "test": args.test}
-    road, stages = find_road(args.road, args.env, folder, seeds), folder / STAGES
-    require_output(folder, own=[STAGES])
-    copy = copy_of(args.road)
-    require_output(copy.parent, [copy.name], force=True)
-    road.check(stages, args.tries)
-    place = args.place(stages)
+    """Fit a road, or tune settings."""
+    integer("trials", args.trials, 1)
+    for name in OF_FIT if args.tune else OF_TUNE:
+        given, option = getattr(args, name), f"--{name.replace('_', '-')}"
+        if given != getattr(Args, name):
+            raise ValueError(
+                f"{option} must be left out {'with' if args.tune else 'without'} --tune"
+            )
+    if args.tune:
+        tune_settings(args)
+    elif args.road is not None:
+        fit_road(args, args.road)
+    else:
+        raise ValueError("road must be given, unless with --tune")
 
-    begin(0)
-    library = RecordLibrary(args.records)
-    record(road.corridor, road.all_seeds, library, progress=True, workers=args.workers)
+
+def tune_settings(args: Args) -> None:
+    """Record what is missing, run the trials that are missing, and write the sets."""
+    searches, folder = make_searches(args)
+    journal = folder / JOURNAL
+    foreign = [f"{n}.json" for n, search in searches.items() if not search.is_begun(journal)]
+    require_output(folder, foreign, force=args.force)
+    columns = "set", "settings", "reward", "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"
+    table, found = make_table("scores on the tuning traffic", *columns, left=2), {}
+    executor = make_executor("local", args.workers or 1)
+    for name, search in searches.items():
+        args.library(search.config.corridor, search.seeds)
+        study = tune(search, journal, args.trials, executor)
+        settings = write_set(search, study, folder / f"{name}.json")
+        found[name] = {"estimator": search.estimator, "estimator_settings": settings}
+        for label, trial in chosen(study).items():
+            errors = [f"{trial.user_attrs[key]:.2f}" for key in ("rmse_density", "rmse_speed")]
+            table.add_row(name, label, f"{trial.value:.5f}", *errors)
+        table.add_section()
+    said = [json.dumps(keywords) for keywords in found.values()]
+    args.answer(found, table, f"sets are in {folder}/; as keywords of the environment:", *said)
+
+
+def make_searches(args: Args) -> tuple[dict[str, Search], Path]:
+    """Return the searches by the names of their sets, all of them checked, and their folder.
+
+    Raises:
+        FileNotFoundError: There is no such saved policy.
+        ValueError: An argument is out of range.
+    """
+    integer("seed", args.seed, 0)
+    policies = args.policies or ("shift-ahead",)
+    require(len(policies) == 1, "policies", "one with --tune", policies)
+    env, keywords = parse_env(args.env)
+    folder = Path("results") / "tuning"
+    if args.road is not None:
+        require_road(args.road)
+        require("corridor" not in keywords, "env.corridor", "left out with a road", keywords)
+        keywords["corridor"] = str(args.road)
+        folder = folder_of(args.road) / "tuned"
+    corridor = dataclasses.replace(args, env=f"{env} {json.dumps(keywords)}").corridor()
+    seeds = seeds_of("training", args.train_seeds, corridor, str(args.road or env))
+    found = {}
+    for estimator in args.estimators or SPACE:
+        search = Search(
+            env, keywords, estimator, seeds, policies[0], args.also, args.seed, args.records
+        )  # fmt: skip
+        search.check()
+        found[search.name] = search
+    return found, args.output or folder
+
+
+def folder_of(road: Path) -> Path:
+    """Return the folder of the fit of a road file, where no other one is given."""
+    return road.with_name(f"{road.stem}-fit")
+
+
+def fit_road(args: Args, path: Path) -> None:
+    """Fit, choose, evaluate, and write the page and the road file."""
+    folder = args.output or folder_of(path)
+    road, stages, copy = checked_road(args, path, folder), folder / STAGES, copy_of(path)
+    place, begin = args.place(stages), steps(args)
+    begin()
+    library = args.library(road.corridor, road.all_seeds)
     dwell = road.measure_dwell(library)
-    road.begin(stages, args.tries, dwell)
+    road.begin(stages, args.trials, dwell)
     choice = Choice(road, stages, shipped_sets(road))
-    begin(1)
+    begin()
     density, speed = traffic_of(road.corridor, road.seeds["training"], library)
-    fit = fitted(choice, place, library, args.tries, 1.01 * float(density.max()))
+    fit = fitted(choice, place, library, args.trials, 1.01 * float(density.max()))
     name = fit.parameters.name
     keep(folder / f"{name}.json", fit, road)
     choice.sets[name] = {"parameters": str(folder / f"{name}.json")}
-    notes = choose(choice, fit, place, args)
-    begin(5)
-    rows = choice.play(test_cells(choice, args), place)
+    begin()
+    choice.parameters = choice.home
+    choice.choose([{"parameters": each} for each in choice.sets], place)
+    notes = notes_on(choice, fit)
+    if args.keep_fitted:
+        choice.parameters = name
+    begin()
+    estimators = args.estimators or ESTIMATORS_TRIED
+    options: list[Mapping[str, str]] = [{"estimator": each} for each in estimators]
+    if road.present:
+        choice.sets[PRESENT] = dict(road.present)
+        estimator = str(road.present.get("estimator", road.config.estimator))
+        options.append({"parameters": PRESENT, "estimator": estimator})
+    choice.choose(options, place)
+    begin()
+    policies = args.policies or POLICIES_TRIED
+    choice.choose([{"policy": each} for each in policies], place)
+    begin()
+    rows = choice.play(test_cells(choice, estimators, policies), place)
 
     keywords = chosen_keywords(choice, road)
     notes += [*inherits(choice, keywords), *road.remarks, *dict.fromkeys(choice.refused)]
@@ -123,40 +224,41 @@ def main(args: Args) -> None:
     outcome = Outcome(choice, sets, density, speed, dwell, notes, commands(args, choice, folder))
     write_atomically(folder / PAGE, write(outcome, rows, place))
     changed = write_choice(
-        args.road,
-        {key: _in_file(args.road, value) for key, value in keywords.items()},
+        path,
+        {key: _in_file(path, value) for key, value in keywords.items()},
         dwell if "average_dwell" in road.assumed else None,
     )
-    if args.json:
-        print(json.dumps(as_json(choice, keywords, notes, rows), indent=2))
-        return
-    print(answer(choice))
-    for note in notes:
-        print(f"- {note}")
+    said = [verdict(choice), *(f"- {note}" for note in notes)]
     if changed:
-        print(f"{args.road} has the table [environment] now; {copy} is as it was")
-    print(f"open {folder / PAGE} in a browser: it says what to do next")
+        said.append(f"{path} has the table [environment] now; {copy} is as it was")
+    said.append(f"open {folder / PAGE} in a browser: it says what to do next")
+    args.answer(as_json(choice, keywords, notes, rows), *said)
 
 
-def choose(choice: Choice, fit: Fit, place: Place, args: Args) -> list[str]:
-    """Choose parameters, estimator and query rule; return notes on the parameters."""
-    begin(2)
-    choice.parameters = choice.home
-    choice.choose([{"parameters": name} for name in choice.sets], place)
-    notes = notes_on(choice, fit)
-    if args.keep_fitted:
-        choice.parameters = fit.parameters.name
-    begin(3)
-    options: list[Mapping[str, str]] = [{"estimator": name} for name in args.estimators]
-    present = choice.road.present
-    if present:
-        choice.sets[PRESENT] = dict(present)
-        estimator = str(present.get("estimator", choice.road.config.estimator))
-        options.append({"parameters": PRESENT, "estimator": estimator})
-    choice.choose(options, place)
-    begin(4)
-    choice.choose([{"rule": name} for name in args.rules], place)
-    return notes
+def checked_road(args: Args, path: Path, folder: Path) -> Road:
+    """Return a road after all that is given was checked, before any work."""
+    for estimator in args.estimators:
+        check_estimator(estimator, "compiled")
+    given = args.train_seeds, args.validation_seeds, args.test_seeds
+    road = find_road(path, args.env, folder, dict(zip(KINDS, given, strict=True)))
+    for policy in args.policies:
+        road.cell(policy).check()
+    require_output(folder, own=[STAGES])
+    copy = copy_of(path)
+    require_output(copy.parent, [copy.name], force=True)
+    road.check(folder / STAGES, args.trials)
+    return road
+
+
+def steps(args: Args) -> Callable[[], None]:
+    """Return a function that says which of `STEPS` begins."""
+    waiting = enumerate(STEPS, 1)
+
+    def begin() -> None:
+        number, step = next(waiting)
+        args.remark(f"[{number}/{len(STEPS)}] {step}")
+
+    return begin
 
 
 def as_json(
@@ -166,18 +268,13 @@ def as_json(
     return {
         "parameters": choice.parameters,
         "estimator": choice.estimator,
-        "rule": choice.rule,
+        "policy": choice.policy,
         "environment": keywords,
         "notes": notes,
         "test": [
             {**labels, "error": values(choice.rows, labels, ERROR).tolist()} for labels in rows
         ],
     }
-
-
-def begin(step: int) -> None:
-    """Say which step begins."""
-    print(f"[{step + 1}/{len(STEPS)}] {STEPS[step]}", file=sys.stderr)
 
 
 def shipped_sets(road: Road) -> dict[str, dict[str, Any]]:
@@ -187,21 +284,21 @@ def shipped_sets(road: Road) -> dict[str, dict[str, Any]]:
     return {name: {"parameters": name} for name in stable}
 
 
-def fitted(choice: Choice, place: Place, library: RecordLibrary, tries: int, densest: float) -> Fit:
+def fitted(
+    choice: Choice, place: Place, library: RecordLibrary, trials: int, densest: float
+) -> Fit:
     """Search parameters, from the shipped set with which the filter errs least in training."""
     road, base = choice.road, DEFAULT_PARAMETERS
+    plain = {"estimator": FILTER, "policy": ROUND_ROBIN}
     if choice.sets:
-        options = [
-            choice.labels("training", parameters=name, estimator=FILTER, rule=ROUND_ROBIN)
-            for name in choice.sets
-        ]
+        options = [choice.labels("training", parameters=name, **plain) for name in choice.sets]
         base = choice.best(choice.play(options, place))["parameters"]
     name = road.corridor.name
     name = f"{name}-road" if name in available_parameters() else name
     start = start_from(load_parameters(base), road.corridor, name)
-    labels = choice.labels("training", parameters="", estimator=FILTER, rule=ROUND_ROBIN)
+    cell = choice.cell(choice.labels("training", parameters="", **plain))
     return fit_parameters(
-        road.corridor, choice.cell(labels), road.seeds["training"], start, densest, library, tries,
+        road.corridor, cell, road.seeds["training"], start, densest, library, trials,
         choice.stages / SEARCH,
     )  # fmt: skip
 
@@ -244,17 +341,17 @@ def notes_on(choice: Choice, fit: Fit) -> list[str]:
     return [*found, *fit.at_bounds]
 
 
-def test_cells(choice: Choice, args: Args) -> list[Labels]:
+def test_cells(
+    choice: Choice, estimators: Sequence[str], policies: Sequence[str]
+) -> list[dict[str, str]]:
     """Return what is played on test traffic: what was chosen, and what it is compared with."""
-    plain = {"estimator": FILTER, "rule": ROUND_ROBIN}
-    wanted = [
-        choice.labels("test"),
-        choice.labels("test", parameters=choice.home, **plain),
-        choice.labels("test", **plain),
-        choice.labels("test", rule=ROUND_ROBIN),
-    ]
-    wanted += [choice.labels("test", estimator=e, rule=ROUND_ROBIN) for e in args.estimators]
-    wanted += [choice.labels("test", rule=rule) for rule in args.rules]
+    plain = {"estimator": FILTER, "policy": ROUND_ROBIN}
+    changes: list[dict[str, str]] = [
+        {}, {"parameters": choice.home, **plain}, plain, {"policy": ROUND_ROBIN},
+        *({"estimator": each, "policy": ROUND_ROBIN} for each in estimators),
+        *({"policy": each} for each in policies),
+    ]  # fmt: skip
+    wanted = [choice.labels("test", **each) for each in changes]
     return [dict(each) for each in dict.fromkeys(tuple(labels.items()) for labels in wanted)]
 
 
@@ -279,7 +376,7 @@ def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:
         "parameters": f"the parameters {config.parameters.name} were fitted to another road",
         "estimator_settings": (
             f"the settings {config.settings_name} were tuned on another road with "
-            f"{tuned_with(config.parameters)}: dptse tune makes settings of your own"
+            f"{tuned_with(config.parameters)}: dptse fit --tune makes settings of your own"
         ),
     }
     return [said.get(key, f"{key} is of another road") for key in config.inherited]
@@ -294,34 +391,33 @@ def arz(choice: Choice, name: str) -> ARZParameters:
 def commands(args: Args, choice: Choice, folder: Path) -> list[tuple[str, str]]:
     """Return what to do next, as command lines that run."""
     road = choice.road
-    given = {**parse_env(args.env)[1], "corridor": args.road.as_posix()}
+    given = {**parse_env(args.env)[1], "corridor": road.path.as_posix()}
     env = shlex.quote(f"{road.env} {json.dumps(given)}")
     seeds = {kind: f"{each[0]}:{each[-1] + 1}" for kind, each in road.seeds.items()}
-    rules = " ".join(dict.fromkeys((ROUND_ROBIN, choice.rule)))
+    policies = " ".join(dict.fromkeys((ROUND_ROBIN, shlex.quote(choice.policy))))
     start, policy = f"--env {env}", folder / "policy"
+    evaluate = f"dptse evaluate {start} --test-seeds {seeds['test']} --reference {ROUND_ROBIN}"
     return [
         (
-            "Look at episodes of the chosen rule in a browser:",
-            f"dptse evaluate {start} --schedules {rules} --reference {ROUND_ROBIN} "
-            f"--seeds {seeds['test']} --html --output {folder / 'evaluation'}",
+            "Look at episodes of the chosen policy in a browser:",
+            f"{evaluate} --policies {policies} --html --output {folder / 'evaluation'}",
         ),
         (
             "Train a query policy, some minutes:",
-            f"dptse train {start} --steps 300000 "
-            f"--train-seeds {seeds['training']} --validation-seeds {seeds['validation']} "
-            f"--output {policy}",
+            f"dptse train {start} --steps 300000 --train-seeds {seeds['training']} "
+            f"--validation-seeds {seeds['validation']} --output {policy}",
         ),
         (
             "Compare it with the rules:",
-            f"dptse evaluate {start} --schedules {rules} --reference {ROUND_ROBIN} "
-            f"--policies {policy / 'best.safetensors'} --seeds {seeds['test']} "
+            f"{evaluate} --policies {policies} {policy / 'best.safetensors'} "
             f"--output {folder / 'comparison'}",
         ),
         (
             "Tune the settings of the EKF on this road, and name the file that it writes in the "
             "table [environment] of the road file:",
-            f"dptse tune {start} --estimators {FILTER} --schedule {ROUND_ROBIN} "
-            f"--also demand noise-scale --seeds {seeds['training']} --output {folder / 'tuned'}",
+            f"dptse fit --tune {shlex.quote(str(road.path))} --env {shlex.quote(args.env)} "
+            f"--estimators {FILTER} --policies {ROUND_ROBIN} --also demand noise-scale "
+            f"--train-seeds {seeds['training']} --output {folder / 'tuned'}",
         ),
     ]
 

@@ -1,1 +1,1 @@
-"""From a road file to parameters, an estimator and a query rule that suit the road."""
+"""From a road file to parameters, an estimator and a query policy that suit the road."""

@@ -1,7 +1,7 @@
 """Comparisons of a fit on validation traffic, its choices there, and its episodes on test traffic.
 
 Each choice is made with the one before it: the parameters with an EKF and round robin, the
-estimator with these parameters, the query rule with this estimator.
+estimator with these parameters, the query policy with this estimator.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from agents.tables import ERROR, values
 
 NAME = "fit"
 FILTER, ROUND_ROBIN = "ekf", "round-robin"
-"""Estimator and query rule with which parameters are chosen."""
+"""Estimator and query policy with which parameters are chosen."""
 
 ESTIMATORS_TRIED = (
     "asm", "blend", "ekf", "enkf", "mixture", "random_walk", "recurrent", "ukf",
 )  # fmt: skip
 """Estimators among which a fit chooses: all that take less than a millisecond a second."""
 
-RULES_TRIED = (
+POLICIES_TRIED = (
     ROUND_ROBIN, "shift-ahead", "oldest-first", "largest-variance", "stale-variance",
     "largest-deviation", "speed-front", "expected-reduction",
 )  # fmt: skip
-"""Query rules among which it chooses."""
+"""Query policies among which it chooses."""
 
 FEW = 4
 """Seeds of validation traffic below which a choice is by the mean alone."""
@@ -53,7 +53,7 @@ class Choice:
         refused: What could not be played, and why, a sentence each.
         parameters: The chosen set.
         estimator: The chosen estimator.
-        rule: The chosen query rule.
+        policy: The chosen query policy.
         rows: All rows so far.
     """
 
@@ -63,7 +63,7 @@ class Choice:
     refused: list[str] = field(default_factory=list)
     parameters: str = ""
     estimator: str = FILTER
-    rule: str = ROUND_ROBIN
+    policy: str = ROUND_ROBIN
     rows: pl.DataFrame = field(default_factory=pl.DataFrame)
 
     @property
@@ -74,7 +74,7 @@ class Choice:
 
     def labels(self, traffic: str, **changes: str) -> dict[str, str]:
         """Return the labels of what is chosen, with changes, on validation or test traffic."""
-        chosen = {"parameters": self.parameters, "estimator": self.estimator, "rule": self.rule}
+        chosen = {"parameters": self.parameters, "estimator": self.estimator, "policy": self.policy}
         return {"traffic": traffic, **chosen, **changes}
 
     def cell(self, labels: Mapping[str, str]) -> Cell:
@@ -89,10 +89,11 @@ class Choice:
         traffic = labels["traffic"]
         return Cell(
             self.road.env,
-            labels["rule"],
+            labels["policy"],
             keywords,
             labels,
             noise_seed=noise[traffic],
+            transferred=True,
             watchers=("honesty",),
             seeds=self.road.seeds[traffic],
         )
@@ -105,7 +106,7 @@ class Choice:
             try:
                 cell.check()
             except ValueError as problem:
-                tried = f"{labels['estimator']} with {labels['parameters']}, {labels['rule']}"
+                tried = f"{labels['estimator']} with {labels['parameters']}, {labels['policy']}"
                 self.refused.append(f"{tried}: {problem}")
             else:
                 cells[cell.id] = cell
@@ -131,8 +132,8 @@ class Choice:
             raise ValueError(f"{self.road.path}: {self.refused[-1]}")
         best, now = self.best(played), self.labels("validation")
         if now not in played or self._is_less(best, now):
-            self.parameters, self.estimator, self.rule = (
-                best[key] for key in ("parameters", "estimator", "rule")
+            self.parameters, self.estimator, self.policy = (
+                best[key] for key in ("parameters", "estimator", "policy")
             )
 
     def _is_less(self, labels: Mapping[str, str], now: Mapping[str, str]) -> bool:

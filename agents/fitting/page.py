@@ -84,16 +84,16 @@ def against(choice: Choice, labels: Labels, reference: Labels, metric: str = ERR
     return f"{found.mean:+.1f} ± {found.half_width:.1f} %"
 
 
-def answer(choice: Choice) -> str:
+def verdict(choice: Choice) -> str:
     """Return the result in two sentences."""
     chosen = choice.labels("test")
-    home = choice.labels("test", parameters=choice.home, estimator=FILTER, rule=ROUND_ROBIN)
+    home = choice.labels("test", parameters=choice.home, estimator=FILTER, policy=ROUND_ROBIN)
     errors = [interval(values_of(pick(choice.rows, each), ERROR)) for each in (chosen, home)]
     return (
         f"On {choice.road.corridor.name} take the estimator {choice.estimator} with the parameters "
-        f"{choice.parameters}, and the query rule {choice.rule}: its error x 1000 on test traffic "
-        f"is {errors[0]}, that of an EKF with the inherited parameters {choice.home} and a round "
-        f"robin {errors[1]} (difference {against(choice, chosen, home)})."
+        f"{choice.parameters}, and the query policy {choice.policy}: its error x 1000 on test "
+        f"traffic is {errors[0]}, that of an EKF with the inherited parameters {choice.home} and a "
+        f"round robin {errors[1]} (difference {against(choice, chosen, home)})."
     )
 
 
@@ -123,16 +123,16 @@ def table_of(choice: Choice, rows: Sequence[tuple[str, Labels]], reference: Labe
 
 
 def tables(choice: Choice, rows: Sequence[Labels]) -> dict[str, str]:
-    """Return the tables of parameters, estimators and query rules on test traffic, by title."""
-    home = choice.labels("test", parameters=choice.home, estimator=FILTER, rule=ROUND_ROBIN)
-    robin = choice.labels("test", rule=ROUND_ROBIN)
-    ekf = choice.labels("test", estimator=FILTER, rule=ROUND_ROBIN)
+    """Return the tables of parameters, estimators and query policies on test traffic, by title."""
+    home = choice.labels("test", parameters=choice.home, estimator=FILTER, policy=ROUND_ROBIN)
+    robin = choice.labels("test", policy=ROUND_ROBIN)
+    ekf = choice.labels("test", estimator=FILTER, policy=ROUND_ROBIN)
 
     def where(**fixed: str) -> list[Labels]:
         return [each for each in rows if fixed.items() <= dict(each).items()]
 
-    sets = where(estimator=FILTER, rule=ROUND_ROBIN)
-    estimators = where(parameters=choice.parameters, rule=ROUND_ROBIN)
+    sets = where(estimator=FILTER, policy=ROUND_ROBIN)
+    estimators = where(parameters=choice.parameters, policy=ROUND_ROBIN)
     rules = where(parameters=choice.parameters, estimator=choice.estimator)
     return {
         "Parameters, with an EKF and a round robin": table_of(
@@ -143,8 +143,8 @@ def tables(choice: Choice, rows: Sequence[Labels]) -> dict[str, str]:
             [(str(each["estimator"]), each) for each in estimators],
             ekf if ekf in estimators else robin,
         ),
-        f"Query rules, with the estimator {choice.estimator}": table_of(
-            choice, [(str(each["rule"]), each) for each in rules], robin
+        f"Query policies, with the estimator {choice.estimator}": table_of(
+            choice, [(str(each["policy"]), each) for each in rules], robin
         ),
     }
 
@@ -162,11 +162,11 @@ def write(outcome: Outcome, rows: Sequence[Labels], place: Place) -> str:
     )  # fmt: skip
     parts = [
         f"<h1>{escape(corridor.name)}</h1>",
-        f"<p class='answer'>{escape(answer(choice))}</p>",
+        f"<p class='answer'>{escape(verdict(choice))}</p>",
         f"<p>{escape(road.env.rpartition('/')[2])}, release model {escape(str(privacy.preset))} "
         f"with ε = {rounded_up(privacy.epsilon)} and δ = {rounded_up(privacy.delta)}, "
         f"bandwidth {road.config.bandwidth}. The estimator, the parameters and the "
-        "rule were chosen on validation traffic; all errors below are of test traffic, which was "
+        "policy were chosen on validation traffic; all errors below are of test traffic, which was "
         f"played once. {escape(intervals)} χ² is the mean square of errors over the reported "
         "deviations: 1 is honest.</p>",
         "<h2>The road</h2>", image(draw_road(corridor)),
@@ -282,12 +282,12 @@ def draw_diagram(outcome: Outcome) -> Figure:
 def draw_episode(choice: Choice, place: Place) -> Figure:
     """Draw truth, estimate and queries of the first seed of test traffic, as it was chosen."""
     seed = choice.road.seeds["test"][0]
-    episode = watch(choice.rule, choice.cell(choice.labels("test")), seed, place.records)
+    episode = watch(choice.policy, choice.cell(choice.labels("test")), seed, place.records)
     history = episode.history
     title = f"estimate of {choice.estimator}"
     panels = [
         RoadMap(f"true density, traffic seed {seed}", history.truth, history),
         estimate_map(history, episode.row[DENSITY], title),
-        RoadMap(f"queried by {choice.rule}", history.queried, history),
+        RoadMap(f"queried by {choice.policy}", history.queried, history),
     ]
     return draw_maps([panels], width=9.0, dpi=110)

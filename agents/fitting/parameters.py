@@ -124,7 +124,7 @@ def fit_parameters(
 
     Args:
         corridor: The road.
-        cell: The filter and the query rule, without parameters.
+        cell: The filter and the query policy, without parameters.
         seeds: Training traffic.
         start: Where the search begins.
         densest: Largest density for a lane in training traffic [veh/km]; no jam is less dense.

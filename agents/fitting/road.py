@@ -11,6 +11,7 @@ from typing import Any
 
 from agents.environments import parse_env, preset_of, quietly
 from agents.files import first_difference, write_json
+from agents.play import Cell
 from agents.seeds import KINDS, require_seeds
 from dptse_env.config import (
     PRESETS,
@@ -82,7 +83,12 @@ class Road:
         """Traffic seeds of all kinds."""
         return tuple(seed for kind in KINDS for seed in self.seeds[kind])
 
-    def identity(self, tries: int) -> dict[str, Any]:
+    def cell(self, policy: str) -> Cell:
+        """Return a query policy on the road, to be checked."""
+        keywords = {**self.keywords, "corridor": str(self.path)}
+        return Cell(self.env, policy, keywords, transferred=True)
+
+    def identity(self, trials: int) -> dict[str, Any]:
         """Return what two fits must share for one to go on with what the other has found."""
         road = self.corridor.fields()
         del road["average_dwell"], road["measured"]  # the fit itself puts them into the file
@@ -91,13 +97,13 @@ class Road:
             "env": self.env,
             "keywords": self.keywords,
             "seeds": self.seeds,
-            "tries": tries,
+            "trials": trials,
             "dptse-env": code_version(),
         }
         found: dict[str, Any] = json.loads(json.dumps(content))
         return found
 
-    def check(self, stages: Path, tries: int) -> None:
+    def check(self, stages: Path, trials: int) -> None:
         """Check that a folder has no fit, or one with the same identity.
 
         Raises:
@@ -105,17 +111,17 @@ class Road:
         """
         if (stages / BEGUN).exists():
             kept = read_json(stages / BEGUN)
-            difference = first_difference(kept, self.identity(tries))
+            difference = first_difference(kept, self.identity(trials))
             if difference is not None:
                 raise ValueError(
                     f"{stages.parent} has the fit of something else: {difference}. Remove the "
                     "folder, or choose another --output"
                 )
 
-    def begin(self, stages: Path, tries: int, dwell: float) -> None:
+    def begin(self, stages: Path, trials: int, dwell: float) -> None:
         """Write down what is fitted, and the road that is played, with the dwell that it has."""
         stages.mkdir(parents=True, exist_ok=True)
-        write_json(stages / BEGUN, self.identity(tries))
+        write_json(stages / BEGUN, self.identity(trials))
         # The file that a fit leaves has more under `measured`, and is the same road.
         played = dataclasses.replace(self.corridor, measured=())
         if "average_dwell" in self.assumed:
@@ -138,6 +144,15 @@ class Road:
             ) from problem
 
 
+def require_road(path: Path) -> None:
+    """Refuse the path of another file than a road.
+
+    Raises:
+        ValueError: Its name has another ending.
+    """
+    require(is_road_file(path), "road", "a road file, whose name ends in .toml", str(path))
+
+
 def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None]) -> Road:
     """Read a road file and check everything that needs no traffic.
 
@@ -154,7 +169,7 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
         MissingExtraError: netconvert is missing.
         NetconvertError: netconvert refuses the road.
     """
-    require(is_road_file(path), "road", "a road file, whose name ends in .toml", str(path))
+    require_road(path)
     road = read_road(path)
     corridor, (env, given) = road.corridor, parse_env(env)
     for key in (*CHOSEN, "corridor", "traffic_seeds", "records"):
@@ -179,7 +194,7 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
         keywords["privacy"] = "corrected"
         decided.append("privacy")
         remarks.append("release model 'corrected', since a measured field has no vehicles")
-    found = _seeds_of(path, corridor, seeds)
+    found = {kind: seeds_of(kind, seeds[kind], corridor, str(path)) for kind in KINDS}
     with quietly():
         more = {"corridor": str(path), "traffic_seeds": list(found["test"])}
         config = resolve(preset_of(env), {**keywords, **more})
@@ -213,30 +228,34 @@ def _check_road(path: Path, corridor: Corridor) -> None:
             )
 
 
-def _seeds_of(
-    path: Path, corridor: Corridor, given: Mapping[str, str | None]
-) -> dict[str, tuple[int, ...]]:
-    """Return the seeds of each kind: those given, all that were recorded, or the usual number."""
-    recorded = None if corridor.recordings is None else recorded_seeds(corridor.recordings)
-    found = {}
-    for kind, allowed in KINDS.items():
-        text = given[kind]
-        if text is not None:
-            found[kind] = parse_seeds(text, kind)
-        elif recorded is None:
-            n = USUAL[kind]
-            found[kind] = tuple(allowed[:n])
-        else:
-            found[kind] = tuple(seed for seed in recorded if seed in allowed)
-            if not found[kind]:
-                raise ValueError(
-                    f"{path}: recordings must have a window of {kind} traffic, got seeds "
-                    f"{ranges(recorded)}: import them again with a shorter duration, or other "
-                    "--shares"
-                )
-        require_seeds(kind, found[kind], allowed)
-    return found
-
-
 USUAL = {"training": 8, "validation": 8, "test": 16}
 """Traffic seeds of each kind on a road that is simulated."""
+
+
+def seeds_of(kind: str, given: str | None, corridor: Corridor, origin: str) -> tuple[int, ...]:
+    """Return traffic seeds of a kind: those given, all that were recorded, or the usual number.
+
+    Args:
+        kind: One of `agents.seeds.KINDS`.
+        given: ``"first:stop"``, or None.
+        corridor: The road.
+        origin: File or environment that the road comes from, for messages.
+
+    Raises:
+        ValueError: They are out of range, or no traffic of this kind was recorded.
+    """
+    option, allowed = f"{kind.removesuffix('ing')}_seeds", KINDS[kind]
+    if given is not None:
+        found = parse_seeds(given, option)
+    elif corridor.recordings is None:
+        found = tuple(allowed[: USUAL[kind]])
+    else:
+        recorded = recorded_seeds(corridor.recordings)
+        found = tuple(seed for seed in recorded if seed in allowed)
+        if not found:
+            raise ValueError(
+                f"{origin}: recordings must have a window of {kind} traffic, got seeds "
+                f"{ranges(recorded)}: import them again with a shorter duration, or other --shares"
+            )
+    require_seeds(option, found, allowed)
+    return found

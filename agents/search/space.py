@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from functools import reduce
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 
@@ -109,15 +109,13 @@ def search_space(estimator: str, extras: Collection[Extra] = ()) -> dict[str, Kn
     """
     require_name("estimators", estimator, SPACE)
     for name in extras:
-        require_name("also", name, get_args(Extra))
+        require_name("also", name, EXTRAS)
     if "demand" in extras and estimator in ("random_walk", "asm"):
         raise ValueError(
             f"also must leave out demand for {estimator!r}, which has no traffic model"
         )
-    space = dict(SPACE[estimator])
-    for name, knobs in EXTRAS.items():
-        space |= knobs if name in extras else {}
-    return space
+    asked = (knobs for name, knobs in EXTRAS.items() if name in extras)
+    return reduce(dict.__or__, asked, SPACE[estimator])
 
 
 def holds(knob: Knob, value: Any) -> bool:
@@ -139,18 +137,15 @@ def at_bound(knob: Knob, value: Any) -> bool:
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values by path as a mapping for `EstimatorSettings`, numbers rounded to four digits.
 
-    Both items of a pair must be there: ``{"process_noise.0": 1.0, "process_noise.1": 2.0}`` becomes
-    ``{"process_noise": [1.0, 2.0]}``.
+    Items of a pair stand in their order: ``{"process_noise.0": 1.0, "process_noise.1": 2.0}``
+    becomes ``{"process_noise": [1.0, 2.0]}``.
     """
     settings: dict[str, Any] = {}
     for path, given in values.items():
         value = float(f"{given:.4g}") if isinstance(given, float) else given
-        *parents, name = path.split(".")
-        is_item = name.isdecimal()
-        if is_item:
-            *parents, name = parents
+        *parents, name = path.removesuffix(".0").removesuffix(".1").split(".")
         group = reduce(lambda node, key: node.setdefault(key, {}), parents, settings)
-        if is_item:
+        if path.endswith((".0", ".1")):
             group.setdefault(name, []).append(value)
         else:
             group[name] = value
@@ -160,10 +155,7 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
 def values_of(settings: EstimatorSettings, space: Mapping[str, Knob]) -> dict[str, Any]:
     """Return the value of every setting in ``space`` by path."""
 
-    def at(path: str) -> Any:
-        node: Any = settings
-        for key in path.split("."):
-            node = node[int(key)] if key.isdecimal() else getattr(node, key)
-        return node
+    def below(node: Any, key: str) -> Any:
+        return node[int(key)] if key.isdecimal() else getattr(node, key)
 
-    return {path: at(path) for path in space}
+    return {path: reduce(below, path.split("."), settings) for path in space}

@@ -1,7 +1,7 @@
 """Tuned settings of the estimators: those that ship, files of others, which an environment gets.
 
 ``tuned.json`` has a table by name: ``<estimator>-<ARZ parameters>-<privacy preset>``, and for those
-of a road or another variant that with its name at the end. ``dptse tune`` writes a file with
+of a road or another variant that with its name at the end. ``dptse fit --tune`` writes a file with
 one such entry, which the keyword ``estimator_settings`` takes. What an entry leaves out has the
 value of `EstimatorSettings`.
 """

@@ -41,9 +41,9 @@ duration = 90
 mainline = [[0, 2400]]  # veh/h
 """
 BRIEF = (
-    "--training", "0:2", "--validation", "1000:1002", "--test", "2000:2002", "--tries", "4",
-    "--estimators", "ekf", "random_walk", "--rules", "round-robin", "oldest-first",
-    "--workers", "1",
+    "--train-seeds", "0:2", "--validation-seeds", "1000:1002", "--test-seeds", "2000:2002",
+    "--trials", "4", "--estimators", "ekf", "random_walk",
+    "--policies", "round-robin", "oldest-first", "--workers", "1",
 )  # fmt: skip
 
 
@@ -98,7 +98,7 @@ def test_the_page_shows_road_choice_and_commands(fitted):
     path, found = fitted
     page = (path.parent / "my-road-fit" / "page.html").read_text(encoding="utf-8")
     assert page.count("<img ") == 3
-    for name in ("w99-3lane", "random_walk", "oldest-first", "dptse train", found["rule"]):
+    for name in ("w99-3lane", "random_walk", "oldest-first", "dptse train", found["policy"]):
         assert name in page
     assert all(note.split(":")[0] in page for note in found["notes"])
 
@@ -115,7 +115,7 @@ def test_the_same_command_plays_nothing_again_and_changes_no_file_of_yours(fitte
     after = files_of(path.parent)
     changed = {each.name for each in after if after[each] != before.get(each)}
     assert changed <= {"page.html", "rows.parquet"}
-    line = refused("fit", path, *BRIEF, "--training", "0:1")
+    line = refused("fit", path, *BRIEF, "--train-seeds", "0:1")
     assert "seeds.training is [0, 1] there and [0] now" in line
 
 
@@ -149,7 +149,7 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
 def test_a_killed_fit_goes_on_with_what_it_has_tried(tmp_path):
     path = tmp_path / "my-road.toml"
     path.write_text(ROAD)
-    words = "fit", path, *BRIEF, "--tries", "20"
+    words = "fit", path, *BRIEF, "--trials", "20"
     kept = tmp_path / "my-road-fit" / "stages" / "search.json"
     where = "agents.fitting.parameters", "write_json", 7
     assert run_killed(*where, "scripts.dptse", *words).returncode == -9
@@ -231,7 +231,7 @@ def test_a_choice_changes_for_what_is_certainly_better(errors, chosen, tmp_path,
         lambda rows, labels, metric: np.array(errors[labels["estimator"]], float),
     )
     choice.choose([{"estimator": name} for name in errors], Place(tmp_path, this_process))
-    assert (choice.estimator, choice.rule) == (chosen, "round-robin")
+    assert (choice.estimator, choice.policy) == (chosen, "round-robin")
 
 
 @pytest.mark.parametrize(
@@ -308,7 +308,7 @@ SHORT = ROAD.replace("segment_length = 0.1", "segment_length = [0.1, 0.1, 0.04, 
         (NO_DEMAND, [], "my-road.toml: demand.mainline must be above 0 veh/h at some time"),
         (SHORT, [], "my-road.toml: segment 2 of 0.04 km must be longer than 0.044 km at 140 km/h"),
         (ROAD.replace("90\n", "60\n", 2), [], "my-road.toml: duration must be more than the 60 s"),
-        (ROAD, ["--test", "1000:1004"], "test must be traffic seeds in 2000..2999"),
+        (ROAD, ["--test-seeds", "1000:1004"], "test_seeds must be traffic seeds in 2000..2999"),
         (ROAD, ["--env", f'{ID} {{"parameters": "published"}}'], "env.parameters must be left out"),
         (ROAD, ["--estimators", "kalman"], "estimator must be one of"),
     ],
@@ -342,7 +342,7 @@ def import_field(folder, windows):
 
 def test_a_measured_field_with_one_test_window_is_fitted(tmp_path):
     path = import_field(tmp_path, 3)
-    words = ["--tries", "2", "--estimators", "ekf", "--rules", "round-robin", "--workers", "1"]
+    words = ["--trials", "2", "--estimators", "ekf", "--policies", "round-robin", "--workers", "1"]
     done = run_command("fit", path, *words)
     assert done.returncode == 0, done.stderr
     assert "release model 'corrected', since a measured field has no vehicles" in done.stdout

@@ -22,8 +22,8 @@ from tests.scripts.commands import run_command
 
 from .blocks import blocks_of, commands
 
-FIT = "--tries 1 --estimators ekf --rules round-robin --workers 1"
-SEEDS = "--training 0:2 --validation 1000:1002 --test 2000:2002"
+FIT = "--trials 1 --estimators ekf --policies round-robin --workers 1"
+SEEDS = "--train-seeds 0:2 --validation-seeds 1000:1002 --test-seeds 2000:2002"
 GUIDES = {
     "train-a-policy.md": {
         "--minutes 8": "--steps 8192 --train-seeds 0:2 --validation-seeds 1000:1002",
@@ -132,7 +132,7 @@ def test_a_road_file_becomes_a_compared_policy(run_guide):
     chosen = tomllib.loads(Path("my-road.toml").read_text(encoding="utf-8"))["environment"]
     assert f"\n{chosen['estimator']} [" in printed
     page = Path("my-road-fit/page.html").read_text(encoding="utf-8")
-    assert all(each in page for each in ("dptse train", "dptse evaluate", "dptse tune"))
+    assert all(each in page for each in ("dptse train", "dptse evaluate", "dptse fit --tune"))
     assert "best" in Path("my-road-fit/comparison/tables.md").read_text(encoding="utf-8")
 
 

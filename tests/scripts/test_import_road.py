@@ -140,7 +140,7 @@ def commands_of(name):
 
 
 SMALL = {
-    "fit": ["--tries", "1", "--estimators", "ekf", "--rules", "round-robin", "--workers", "1"],
+    "fit": ["--trials", "1", "--estimators", "ekf", "--policies", "round-robin", "--workers", "1"],
     "evaluate": ["--workers", "1"],
     "train": ["--steps", "2000"],
 }

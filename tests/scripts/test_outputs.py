@@ -28,7 +28,9 @@ COMMANDS = {
     "evaluate": (["--env", SHORT, *ONE], "tables.md"),
     "train": (["--env", SHORT, "--steps", "100", *ONE], "best.safetensors"),
     "train-estimator": (SMALL, "weights-flows.safetensors"),
-    "tune": (["--env", SHORT, "--estimators", "random_walk"], "random_walk-published-printed.json"),
+    "fit --tune": (
+        ["--env", SHORT, "--estimators", "random_walk"], "random_walk-published-printed.json",
+    ),
     "suite": (["speed-front", "--cells", "short", *ONE], "card.json"),
     "study": (["examples.my_study:STUDY", *ONE], "tables.md"),
     "fit": (["road.toml", *ONE], "page.html"),
@@ -105,7 +107,8 @@ def test_a_place_where_results_cannot_go_is_refused_before_any_work(name, tmp_pa
         taken = tmp_path / ("taken" if not is_one else f"taken{kept}")
         mine = taken if is_one else taken / kept
         mine.mkdir(parents=True)
-        force = ["--force"] if "--force" in run_command(*name.split(), "-h").stdout else []
+        takes_force = name != "fit" and "--force" in run_command(*name.split(), "-h").stdout
+        force = ["--force"] if takes_force else []
         assert str(mine) in refused(*given(taken), *force)  # which removes no folder
         mine.rmdir()
         mine.write_text("mine")

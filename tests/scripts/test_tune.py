@@ -2,41 +2,66 @@ import json
 import sys
 
 import gymnasium as gym
+import optuna
 import pytest
 
-from agents.search.tuning import FINISHED
-from scripts.tune import Args, main
+from agents.search.tuning import n_finished
 from tests.helpers import SHORT, run_killed
+from tests.scripts.commands import refused, run_command
+
+TUNE = ("fit", "--tune", "--trials", "3", "--estimators", "random_walk")
+ROAD = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
 
 
-def test_it_leaves_a_set_per_configuration(tmp_path, capsys):
-    envs = tuple(f'{SHORT} {{"privacy": "{privacy}"}}' for privacy in ("printed", "corrected"))
-    args = Args(env=envs, estimators=("random_walk",), seeds="0:2", trials=3, output=tmp_path)
-    main(args)
-    printed = capsys.readouterr().out.splitlines()
-    for privacy, line in zip(("printed", "corrected"), printed[-2:], strict=True):
-        name = f"random_walk-published-{privacy}"
+def of(privacy):
+    return f'{SHORT} {{"privacy": "{privacy}"}}'
+
+
+def test_it_leaves_a_set_for_each_estimator(tmp_path):
+    words = *TUNE, "blend", "--train-seeds", "0:2", "--output", tmp_path, "--env"
+    done = run_command(*words, of("corrected"))
+    assert done.returncode == 0, done.stderr
+    for estimator, line in zip(
+        ("random_walk", "blend"), done.stdout.splitlines()[-2:], strict=True
+    ):
+        name = f"{estimator}-published-corrected"
         content = json.loads((tmp_path / f"{name}.json").read_text())[name]
-        assert set(content["settings"]) == {"walk_noise"}
-        assert content["provenance"]["n_trials"] == 3
+        provenance = content["provenance"]
+        assert (provenance["n_trials"], provenance["seeds"]) == (3, "0:2")
         keywords = json.loads(line)
-        env = gym.make(SHORT, privacy=privacy, **keywords).unwrapped
+        env = gym.make(SHORT, privacy="corrected", **keywords).unwrapped
         assert list(env.config.settings().walk_noise) == content["settings"]["walk_noise"]
         keywords["estimator_settings"] = str(tmp_path / f"{name}.json")
-        assert env.config == gym.make(SHORT, privacy=privacy, **keywords).unwrapped.config
-    (tmp_path / "random_walk-published-printed.journal").unlink()
-    with pytest.raises(ValueError, match=r"random_walk-published-printed\.json"):
-        main(args)
+        assert env.config == gym.make(SHORT, privacy="corrected", **keywords).unwrapped.config
+    found = json.loads(run_command(*words, of("corrected"), "--json").stdout)
+    assert found[name] == json.loads(line)
+    (tmp_path / "random_walk-published-printed.json").write_text("mine")
+    assert "random_walk-published-printed.json" in refused(*words, of("printed"))
+    done = run_command(*words, of("printed"), "--force", "--quiet")
+    assert done == (0, "", "")
+
+
+def test_settings_are_tuned_on_a_road_of_ones_own(tmp_path):
+    path = tmp_path / "my-road.toml"
+    path.write_text(ROAD)
+    words = *TUNE, "--env", f'{SHORT} {{"bandwidth": 1}}', "--train-seeds", "0:1", path
+    done = run_command(*words, "--policies", "round-robin")
+    assert done.returncode == 0, done.stderr
+    (written,) = (tmp_path / "my-road-fit" / "tuned").glob("*.json")
+    (content,) = json.loads(written.read_text()).values()
+    provenance = content["provenance"]
+    assert (provenance["corridor"], provenance["schedule"]) == ("my-road", "round-robin")
+    assert path.read_text() == ROAD
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows kills otherwise")
 def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
     words = (
-        "scripts.dptse", "tune", "--env", SHORT, "--estimators", "ekf", "--seeds", "0:2",
-        "--trials", "16", "--workers", "2", "--output", tmp_path,
+        "scripts.dptse", "fit", "--tune", "--env", SHORT, "--estimators", "ekf",
+        "--train-seeds", "0:2", "--trials", "16", "--workers", "2", "--output", tmp_path,
     )  # fmt: skip
-    journal = tmp_path / "ekf-published-printed.journal"
+    journal = tmp_path / "trials.journal"
     assert run_killed("dptse_env.utils.progress:tqdm", "update", 4, *words).returncode == -9
     n = finished(journal)
     assert 4 <= n < 16
@@ -48,21 +73,30 @@ def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
 
 def finished(journal):
     """Count trials that were completed or stopped early."""
-    records = [json.loads(line) for line in journal.read_text().splitlines() if line.endswith("}")]
-    return sum(each["op_code"] == 6 and each["state"] in FINISHED for each in records)
+    backend = optuna.storages.journal.JournalFileBackend(str(journal))
+    storage = optuna.storages.JournalStorage(backend)
+    (name,) = optuna.get_all_study_names(storage)
+    return n_finished(optuna.load_study(study_name=name, storage=storage))
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("words", "message"),
     [
-        ({"workers": 0}, "workers must be an integer >= 1, got 0"),
-        ({"trials": 0}, "trials must be an integer >= 1, got 0"),
-        ({"estimators": ("ekf", "ekf")}, "ekf-published-printed must be tuned once"),
-        ({"estimators": ()}, "must not be empty"),
-        ({"seeds": "2000:2008"}, "seeds must be traffic seeds"),
+        (["--workers", "0"], "workers must be an integer >= 1, got 0"),
+        (["--trials", "0"], "trials must be an integer >= 1, got 0"),
+        (["--policies", "random", "round-robin"], "policies must be one with --tune"),
+        (["--train-seeds", "2000:2008"], "train_seeds must be traffic seeds"),
+        (["--test-seeds", "2000:2008"], "--test-seeds must be left out with --tune"),
+        (["--keep-fitted"], "--keep-fitted must be left out with --tune"),
+        (["road.toml", "--env", f'{SHORT} {{"corridor": {{}}}}'], "env.corridor must be left out"),
     ],
 )
-def test_bad_arguments_are_named_and_nothing_is_written(changes, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        main(Args(**{"env": (SHORT,), "output": tmp_path / "out", **changes}))
+def test_bad_arguments_are_named_and_nothing_is_written(words, message, tmp_path):
+    assert message in refused(*TUNE, "--env", SHORT, "--output", tmp_path / "out", *words)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("option", [["--also", "demand"], ["--seed", "1"], ["--force"]])
+def test_options_of_tune_are_refused_without_it(option):
+    assert f"{option[0]} must be left out without --tune" in refused("fit", "my-road.toml", *option)
+    assert refused("fit") == "error: road must be given, unless with --tune"
