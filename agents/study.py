@@ -56,7 +56,7 @@ class Place(NamedTuple):
     """
 
     folder: Path
-    executor: Executor
+    executor: Executor = this_process
     records: Records = None
 
 

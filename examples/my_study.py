@@ -1,12 +1,19 @@
 """A study of one's own: does it pay to query the segments around a speed front?
 
-It plays two rules with three bandwidths on eight traffic seeds, in half a minute, and writes
-``rows.parquet`` (an episode a line), ``tables.md`` and a figure. An interrupted run goes on, and
-``--report`` writes tables and figure again from the rows alone.
+python my_study.py
 
-dptse study examples.my_study:STUDY --output results/my-study
-dptse study examples.my_study:STUDY --output results/my-study --report
+It plays two rules with three bandwidths on eight traffic seeds, in half a minute, and writes
+``rows.parquet`` (an episode a line), ``tables.md`` and a figure to ``results/my-study``. An
+interrupted run goes on. The command has more options, as ``--report``, which writes tables and
+figure again from the rows alone:
+
+dptse study my_study:STUDY --report
 """
+
+# ruff: noqa: E402 (the tools are importable once their folder is on the path)
+from dptse_env.tools import add_tools_path
+
+add_tools_path()
 
 from pathlib import Path
 
@@ -21,7 +28,7 @@ from agents.figures import (
 )
 from agents.play import Cell
 from agents.statistics import Interval
-from agents.study import Study
+from agents.study import Place, Study, run
 from agents.tables import (
     DENSITY,
     METRICS,
@@ -89,3 +96,7 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
 
 
 STUDY = Study("my-study", CELLS, tuple(range(2000, 2008)), report)
+
+
+if __name__ == "__main__":
+    run(STUDY, Place(Path("results/my-study")))

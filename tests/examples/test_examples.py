@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 
@@ -20,10 +21,10 @@ def need(module):
         pytest.skip(f"{module} cannot be imported: {done.stderr.strip().splitlines()[-1]}")
 
 
-def run(*arguments):
-    """Run Python on arguments in the root of the checkout and return what it prints."""
+def run(*arguments, cwd=ROOT):
+    """Run Python on arguments in a folder and return what it prints."""
     done = subprocess.run(
-        [sys.executable, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True,
+        [sys.executable, *map(str, arguments)], cwd=cwd, capture_output=True, text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
@@ -55,10 +56,13 @@ def test_a_schedule_of_ones_own():
 
 
 def test_a_study_of_ones_own(tmp_path):
-    study = ("scripts/dptse.py", "study", "examples.my_study:STUDY", "--output", tmp_path)
-    run(*study)
-    first = (tmp_path / "tables.md").read_text(encoding="utf-8")
-    (tmp_path / "tables.md").unlink()
-    run(*study, "--report")
-    assert (tmp_path / "tables.md").read_text(encoding="utf-8") == first
+    example = ROOT / "examples" / "my_study.py"
+    folder = tmp_path / "results" / "my-study"
+    shutil.copy(example, tmp_path)
+    run("my_study.py", cwd=tmp_path)
+    first = (folder / "tables.md").read_text(encoding="utf-8")
+    (folder / "tables.md").unlink()
+    study = (ROOT / "scripts" / "dptse.py", "study", "examples.my_study:STUDY", "--output", folder)
+    run(*study, "--report", cwd=tmp_path)
+    assert (folder / "tables.md").read_text(encoding="utf-8") == first
     assert "paired" in first

@@ -135,7 +135,7 @@ def use_package(installed: Installed, wheel: Path) -> None:
 
 
 def use_tools(installed: Installed, wheel: Path) -> None:
-    """Train, evaluate and look at a policy with the installed commands, from an empty folder."""
+    """Train and evaluate with the installed commands, and run a study, from an empty folder."""
     empty = installed.folder / "empty"
     empty.mkdir()
     # torch first: a looser request may bring another build.
@@ -147,6 +147,9 @@ def use_tools(installed: Installed, wheel: Path) -> None:
         installed.run(installed.python.with_name("dptse"), *words, cwd=empty)
     assert (empty / "trained" / "policy.safetensors").is_file()
     assert (empty / "ladder" / "tables.md").is_file()
+    shutil.copy(ROOT / "examples" / "my_study.py", empty)
+    installed.run(installed.python, "my_study.py", cwd=empty)
+    assert (empty / "results" / "my-study" / "tables.md").is_file()
     installed.run(installed.python, HERE / "extras.py", "train", cwd=installed.folder)
 
 
