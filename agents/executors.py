@@ -127,7 +127,8 @@ def _in_processes(
                 for index, task in islice(waiting, 2 * workers - len(running)):
                     with uninterrupted():
                         running[pool.submit(work, task)] = index
-                for future in wait(running, LONGEST_WAIT, FIRST_COMPLETED).done:
+                done = wait(running, LONGEST_WAIT, FIRST_COMPLETED).done
+                for future in sorted(done, key=_is_lost):  # results that there are come first
                     index, result = running.pop(future), future.result()
                     del left[index]
                     deaths = 0
@@ -139,6 +140,10 @@ def _in_processes(
         except BaseException:
             pool.shutdown(kill_workers=True)
             raise
+
+
+def _is_lost(future: Future[Any]) -> bool:
+    return isinstance(future.exception(), BrokenExecutor)
 
 
 def _begin(parent: int, is_said: bool) -> None:
