@@ -98,7 +98,7 @@ format: setup  ## Format the code.
 
 benchmark: setup  ## Time estimators, environments, learning and long roads; results/benchmarks.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[benchmark]'
-	$(BIN)/python -m benchmarks --output results/benchmarks/tables.md
+	$(BIN)/python -m benchmarks --output results/benchmarks
 
 dist: setup  ## Build and check the archives of a release; dist/.
 	$(BIN)/python -m build --outdir dist

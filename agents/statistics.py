@@ -52,23 +52,6 @@ def mean_interval(values: ArrayLike) -> Interval:
     return Interval(mean, float(low), float(high), len(array))
 
 
-def geometric_mean_interval(values: ArrayLike) -> Interval:
-    """Return the geometric mean of positive values with its 95 % interval.
-
-    For times and ratios: the interval is that of the logarithms, so it never reaches zero, and
-    the inverse ratios give the inverse interval.
-
-    Raises:
-        ValueError: There are fewer than two values or one is not positive and finite.
-    """
-    array = np.asarray(values, dtype=np.float64)
-    if not (array > 0.0).all():
-        raise ValueError(f"values must be above zero, got {array.tolist()}")
-    logs = mean_interval(np.log(array))
-    mean, low, high = (float(np.exp(end)) for end in (logs.mean, logs.low, logs.high))
-    return Interval(mean, low, high, logs.n)
-
-
 def interquartile_mean(table: FloatArray) -> FloatArray:
     """Return the interquartile mean over training seeds of means over traffic seeds.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 from rich import box
 from rich.console import Console
 from rich.measure import Measurement
@@ -10,11 +12,15 @@ from rich.table import Table
 _UNLIMITED = 100_000
 
 
-def make_table(title: str, *columns: str, left: int = 1) -> Table:
-    """Return an empty table; the first ``left`` columns are left-aligned, numbers go right."""
+def make_table(
+    title: str, *columns: str, left: int = 1, rows: Iterable[Sequence[str]] = ()
+) -> Table:
+    """Return a table; the first ``left`` columns are left-aligned, numbers go right."""
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     for place, header in enumerate(columns):
         table.add_column(header, justify="left" if place < left else "right")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 

@@ -2,12 +2,16 @@
 
 python -m benchmarks --parts estimators
 
+python -m benchmarks --env 'dptse_env:dptse/PrivateHighway-v1' \
+    'dptse_env:dptse/PrivateHighway-v1 {"penetration": 0.1}'
+
 Each part runs in a process of its own, and what it compares takes turns there. Nothing else should
 run beside them.
 """
 
 from __future__ import annotations
 
+import importlib
 import platform
 import traceback
 from concurrent.futures import ProcessPoolExecutor
@@ -17,26 +21,40 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from agents.tables import markdown
-from benchmarks.turns import HEADER, Line, as_cells, measure, show
+from agents.terminal import make_table
+from benchmarks.turns import HEADER, Row, compare, make_batch, stepping, take_turns
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.threads import n_cores
 from dptse_env.versions import versions_with
-from scripts.cli import run
+from scripts.cli import Command, Environments, Output, run
 
 Part = Literal["estimators", "environment", "learning", "long_roads"]
 PACKAGES = ("libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
 
 
-@dataclass(frozen=True)
-class Args:
-    """Measure and print a table for each part."""
+@dataclass(frozen=True, kw_only=True)
+class Args(Output, Environments, Command):
+    """Measure, and print and write a table of each part."""
 
     parts: tuple[Part, ...] = get_args(Part)
     """Parts to measure."""
-    output: Path | None = None
-    """File for one table of all parts, as Markdown."""
+    env: tuple[str, ...] = ()
+    """Environments to compare with the first of them, in place of all parts: each an id, or an id
+    and keywords as JSON, 'ID {"bandwidth": 3}'."""
+    output: Path = Path("results/benchmarks")
+    """Folder of the table, tables.md."""
     quick: bool = False
     """Smallest sizes: whether it runs, not how fast it is."""
+
+
+def measure(part: str, args: Args) -> list[Row]:
+    """Return the rows of a part; here, so that a process of its own can be asked for them."""
+    if not args.env:
+        rows: list[Row] = importlib.import_module(f"benchmarks.{part}").measure(quick=args.quick)
+        return rows
+    n, n_steps, rounds = (2, 2, 2) if args.quick else (256, 20, 25)
+    work = {each: stepping(make_batch(each, n, traffic_seeds="0:16"), n_steps) for each in args.env}
+    return compare(take_turns(work, rounds), dict.fromkeys(args.env[1:], args.env[0]))
 
 
 def main(args: Args) -> None:
@@ -47,23 +65,21 @@ def main(args: Args) -> None:
     """
     versions = ", ".join(map(" ".join, versions_with(*PACKAGES).items()))
     title = f"Python {platform.python_version()}, {n_cores()} cores; {versions}"
-    if args.output is not None:
-        args.output.parent.mkdir(parents=True, exist_ok=True)
-    lines: list[Line] = []
+    args.output.mkdir(parents=True, exist_ok=True)
+    measured: list[Row] = []
     failed: list[str] = []
-    for part in args.parts:
+    for part in ("environments",) if args.env else args.parts:
         try:
             with ProcessPoolExecutor(1, get_context("spawn")) as alone:
-                measured = alone.submit(measure, part, args.quick).result()
+                rows = alone.submit(measure, part, args).result()
         except Exception:
             traceback.print_exc()
             failed.append(part)
             continue
-        show(f"{part}: {title}", measured)
-        lines += measured
-        if args.output is not None:
-            table = markdown(HEADER, map(as_cells, lines), ":--", "--:")
-            write_atomically(args.output, f"# Time of a step\n\n{title}\n\n{table}\n")
+        args.answer(rows, make_table(f"{part}: {title}", *HEADER, rows=rows))
+        measured += rows
+        table = markdown(HEADER, measured, ":--", "--:")
+        write_atomically(args.output / "tables.md", f"# Time of a step\n\n{title}\n\n{table}\n")
     if failed:
         raise SystemExit(f"error: {', '.join(failed)} failed, see above")
 

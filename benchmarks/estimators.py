@@ -10,107 +10,78 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from itertools import cycle
 from typing import Any
 
 from agents.figures import LABELS
-from benchmarks.turns import Line, compare, make_batch, random_queries, take_turns
-from dptse_env.estimators import EstimatorSettings, make_estimator
+from benchmarks.turns import Row, Work, compare, make_batch, sample, take_turns
+from dptse_env.estimators import make_estimator
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 ENV = 'dptse_env:dptse/PaperHighway-v0 {"parameters": "w99-3lane", "bandwidth": 11}'
 REFERENCES = {"ekf": "filterpy", "ukf": "filterpy", "enkf": "numpy", "mhe": "qpsolvers"}
 
+Call = tuple[str, tuple[Any, ...]]
+"""A method of an estimator that changes it, and its arguments."""
 
-class Tap:
-    """Passes the calls of an estimator on and keeps those that change it.
 
-    Attributes:
-        calls: Name and arguments of each call.
-    """
+def tapped_calls(env: SensorQueryVectorEnv, n_steps: int) -> list[Call]:
+    """Return the estimator's calls in an episode's first steps of sampled queries, reset first."""
+    estimator, calls = env.process.estimator, list[Call]()
 
-    def __init__(self, estimator: Any) -> None:
-        """Tap an estimator."""
-        self._estimator = estimator
-        self.calls: list[tuple[str, tuple[Any, ...]]] = []
-
-    def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the estimator, a method that changes it with a record of calls."""
-        method = getattr(self._estimator, name)
-        if name not in ("reset", "predict", "update"):
-            return method
+    def tapped(name: str) -> Any:
+        method = getattr(estimator, name)
 
         def call(*arguments: Any) -> None:
-            # The estimator draws from the generators of a reset.
-            kept = copy.deepcopy(arguments) if name == "reset" else arguments
-            self.calls.append((name, kept))
+            calls.append((name, copy.deepcopy(arguments)))  # it draws from the reset's generators
             method(*arguments)
 
         return call
 
-
-def tapped_calls(env: SensorQueryVectorEnv, n_steps: int) -> list[tuple[str, tuple[Any, ...]]]:
-    """Return the calls of an episode's first steps, with sampled queries, reset first."""
-    tap: Any = Tap(env.process.estimator)
-    env.process.estimator = tap
+    for name in ("reset", "predict", "update"):
+        setattr(estimator, name, tapped(name))
     env.reset(seed=0)
-    for action in random_queries(env, n_steps):
+    for action in sample(env.action_space, n_steps):
         env.step(action)
-    calls: list[tuple[str, tuple[Any, ...]]] = tap.calls
     return calls
 
 
-class Replay:
-    """Another estimator that repeats calls, some steps in each turn, from the reset on."""
+def replaying(
+    name: str, backend: str, env: SensorQueryVectorEnv, calls: list[Call], n_steps: int
+) -> Work:
+    """Return work in which another estimator repeats calls, some steps in each turn."""
+    settings, n = replace(env.config, estimator=name).settings(), env.num_envs
+    estimator: Any = make_estimator(name, backend, env.process.model, n, settings)
+    following = cycle(calls)
 
-    def __init__(
-        self,
-        name: str,
-        backend: str,
-        env: SensorQueryVectorEnv,
-        calls: list[Any],
-        settings: EstimatorSettings,
-    ) -> None:
-        """Make the estimator for the model and the number of episodes of ``env``."""
-        model, n = env.process.model, env.num_envs
-        self.estimator: Any = make_estimator(name, backend, model, n, settings)
-        self._calls, self._episodes, self._next = calls, env.num_envs, 0
-
-    def turn(self, n_steps: int) -> int:
-        """Repeat the calls of some steps; return their number, over all episodes."""
+    def turn() -> None:
         done = 0
         while done < n_steps:
-            if self._next == len(self._calls):
-                self._next = 0
-            name, arguments = self._calls[self._next]
-            self._next += 1
-            if name == "reset":
-                arguments = copy.deepcopy(arguments)
-            getattr(self.estimator, name)(*arguments)
-            if name == "update":
-                self.estimator.estimate()
+            method, arguments = next(following)
+            getattr(estimator, method)(
+                *copy.deepcopy(arguments) if method == "reset" else arguments
+            )
+            if method == "update":
+                estimator.estimate()
                 done += 1
-        return done * self._episodes
+
+    return turn, n * n_steps
 
 
-def measure(*, quick: bool = False) -> list[Line]:
-    """Return the lines of all estimators; the ratios are to one episode, compiled."""
+def measure(*, quick: bool = False) -> list[Row]:
+    """Return the rows of all estimators; the ratios are to one episode, compiled."""
     n_batch, n_steps, block, rounds = (2, 8, 4, 2) if quick else (64, 240, 20, 12)
     alone, batch = (make_batch(ENV, n, traffic_seeds="0:4") for n in (1, n_batch))
-    config = alone.config
-    calls = {env.num_envs: tapped_calls(env, n_steps) for env in (alone, batch)}
+    calls, calls_of_batch = (tapped_calls(env, n_steps) for env in (alone, batch))
     work, bases = {}, {}
-
-    def add(what: str, base: str, name: str, backend: str, env: SensorQueryVectorEnv) -> None:
-        settings = replace(config, estimator=name).settings()
-        replay = Replay(name, backend, env, calls[env.num_envs], settings)
-        work[what] = lambda: replay.turn(block)
-        if base:
-            bases[what] = base
-
     for name in (*REFERENCES, "recurrent", "asm"):
-        label = LABELS[name]
-        add(label, "", name, "compiled", alone)
-        add(f"{label}, batch of {n_batch}", label, name, "compiled", batch)
+        label, own = LABELS[name], {}
+        work[label] = replaying(name, "compiled", alone, calls, block)
+        own[f"{label}, batch of {n_batch}"] = replaying(
+            name, "compiled", batch, calls_of_batch, block
+        )
         if name in REFERENCES:
-            add(f"{label}, {REFERENCES[name]}", label, name, "reference", alone)
+            own[f"{label}, {REFERENCES[name]}"] = replaying(name, "reference", alone, calls, block)
+        work |= own
+        bases |= dict.fromkeys(own, label)
     return compare(take_turns(work, rounds), bases)

@@ -15,29 +15,29 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from benchmarks.turns import Line, Work, compare, make_batch, take_turns
+from benchmarks.turns import Row, Work, compare, make_batch, repeating, sample, take_turns
 from dptse_env.sb3 import ReplicaBaseline, RoadPolicy, SB3VecEnv
 
+LONG = "dptse_env:dptse/LongHighway-v0"
 ROADS = {
     "short road": 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1, "horizon": 120}',
     "the paper's road": 'dptse_env:dptse/PrivateHighway-v1 {"bandwidth": 1, "horizon": 300}',
-    "long road": 'dptse_env:dptse/LongHighway-v0 {"bandwidth": 2, "horizon": 400}',
-    "long road, recurrent": (
-        'dptse_env:dptse/LongHighway-v0 {"bandwidth": 2, "horizon": 400, "estimator": "recurrent"}'
-    ),
+    "long road": LONG + ' {"bandwidth": 2, "horizon": 400}',
+    "long road, recurrent": LONG + ' {"bandwidth": 2, "horizon": 400, "estimator": "recurrent"}',
 }
 REPLICAS = 8
 
 
-def measure(*, quick: bool = False) -> list[Line]:
-    """Return the lines of all roads; the ratios are to the steps of the same road alone."""
+def measure(*, quick: bool = False) -> list[Row]:
+    """Return the rows of all roads; the ratios are to the steps of the same road alone."""
     torch.set_num_threads(1)
     n, n_steps, rounds = (REPLICAS, 8, 2) if quick else (128, 32, 6)
     work, bases = {}, {}
     for road, text in ROADS.items():
         envs = partial(episodes, text, n, "0:2" if quick else "0:32")
-        alone = f"{road}, steps"
-        work[alone] = stepping(envs(), n_steps)
+        env, alone = envs(), f"{road}, steps"
+        actions = np.array(sample(env.action_space, n_steps * n)).reshape(n_steps, n, -1)
+        work[alone] = repeating(env, list(actions), n)
         for name, policy in (("perceptron", "MlpPolicy"), ("road policy", RoadPolicy)):
             work[f"{road}, PPO, {name}"] = learning(envs(), policy, n_steps)
             bases[f"{road}, PPO, {name}"] = alone
@@ -53,24 +53,9 @@ def episodes(text: str, n: int, traffic_seeds: str) -> SB3VecEnv:
     return env
 
 
-def stepping(env: SB3VecEnv, n_steps: int) -> Work:
-    """Return work that takes the steps of a rollout, with sampled actions."""
-    env.action_space.seed(0)
-    actions = np.array([env.action_space.sample() for _ in range(n_steps * env.num_envs)])
-    of_steps = actions.reshape(n_steps, env.num_envs, -1)
-
-    def turn() -> int:
-        for of_step in of_steps:
-            env.step(of_step)
-        return n_steps * env.num_envs
-
-    return turn
-
-
 def learning(env: SB3VecEnv, policy: Any, n_steps: int) -> Work:
     """Return work that learns from a rollout; a perceptron's observations are normalised."""
-    is_road = policy is RoadPolicy
-    size = n_steps * env.num_envs
+    is_road, size = policy is RoadPolicy, n_steps * env.num_envs
     model = PPO(
         policy,
         VecNormalize(env, norm_obs=not is_road, gamma=0.9),
@@ -83,9 +68,4 @@ def learning(env: SB3VecEnv, policy: Any, n_steps: int) -> Work:
         seed=0,
         device="cpu",
     )
-
-    def turn() -> int:
-        model.learn(size, ReplicaBaseline(REPLICAS), reset_num_timesteps=False)
-        return size
-
-    return turn
+    return lambda: model.learn(size, ReplicaBaseline(REPLICAS), reset_num_timesteps=False), size

@@ -7,17 +7,10 @@ as long is linear growth.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
-
-import gymnasium as gym
-
-from agents.environments import quietly
 from agents.figures import LABELS
-from benchmarks.estimators import Replay, tapped_calls
-from benchmarks.turns import Line, compare, take_turns
+from benchmarks.estimators import replaying, tapped_calls
+from benchmarks.turns import Row, compare, make_batch, take_turns
 from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Incident, Scales
-from dptse_env.vector_env import SensorQueryVectorEnv
 
 DURATION = 1200  # [s], in which a vehicle passes 200 segments and a jam ends
 EVERY = 15  # segments from one on-ramp to the next, and from one off-ramp to the next
@@ -50,26 +43,22 @@ def long_road(n_mainline: int) -> Corridor:
     )
 
 
-def measure(*, quick: bool = False) -> list[Line]:
-    """Return the lines of all estimators; the ratios are to the shortest road."""
+def measure(*, quick: bool = False) -> list[Row]:
+    """Return the rows of all estimators; the ratios are to the shortest road."""
     lengths, n_steps, block, rounds = ((16, 21), 6, 3, 2) if quick else ((30, 60, 120), 60, 10, 12)
     work, bases = {}, {}
     for n in lengths:
         road = long_road(n)
         if quick:
             road = road.replaced(duration=60, incident=None)
-        with quietly():
-            env = gym.make_vec(
-                "dptse_env:dptse/PaperHighway-v0", num_envs=1, threads=1, corridor=road,
-                parameters="w99-3lane", bandwidth=n // 3, traffic_seeds=[0],
-            )  # fmt: skip
-        assert isinstance(env, SensorQueryVectorEnv)
-        config, calls = env.config, tapped_calls(env, n_steps)
+        env = make_batch(
+            "dptse_env:dptse/PaperHighway-v0", 1, corridor=road,
+            parameters="w99-3lane", bandwidth=n // 3, traffic_seeds=[0],
+        )  # fmt: skip
+        calls = tapped_calls(env, n_steps)
         for name in ESTIMATORS:
-            settings = replace(config, estimator=name).settings()
-            replay = Replay(name, "compiled", env, calls, settings)
             what, base = (f"{LABELS[name]}, {each} segments" for each in (n, lengths[0]))
-            work[what] = partial(replay.turn, block)
+            work[what] = replaying(name, "compiled", env, calls, block)
             if what != base:
                 bases[what] = base
     return compare(take_turns(work, rounds), bases)

@@ -6,7 +6,6 @@ import pytest
 from agents.statistics import (
     Interval,
     bootstrap,
-    geometric_mean_interval,
     interquartile_mean,
     mean_interval,
     percent_below,
@@ -26,20 +25,9 @@ def test_the_interval_is_students_and_covers_as_often_as_it_says():
     assert mean_interval([2.0, 2.0]) == Interval(2.0, 2.0, 2.0, 2)
 
 
-def test_a_geometric_interval_is_the_same_for_inverse_ratios():
-    values = np.array([0.5, 1.0, 4.0, 3.0])
-    mean, inverse = geometric_mean_interval(values), geometric_mean_interval(1.0 / values)
-    assert mean.mean == pytest.approx(np.prod(values) ** 0.25)
-    assert 0.0 < mean.low < mean.mean < mean.high
-    assert (inverse.low, inverse.high) == pytest.approx((1.0 / mean.high, 1.0 / mean.low))
-    assert mean.n == 4
-
-
 REFUSED = [
     (mean_interval, ([1.0],), "at least 2 values"),
     (mean_interval, ([1.0, float("nan")],), "finite"),
-    (geometric_mean_interval, ([1.0, 0.0],), "must be above zero"),
-    (geometric_mean_interval, ([1.0, np.nan],), "must be above zero"),
     (bootstrap, (interquartile_mean, np.ones((5, 1))), r"2 traffic seeds, got shape \(5, 1\)"),
     (bootstrap, (interquartile_mean, np.ones((0, 4))), "a training seed"),
     (bootstrap, (interquartile_mean, np.ones((2, 3, 4))), r"got shape \(2, 3, 4\)"),

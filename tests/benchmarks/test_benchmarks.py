@@ -5,35 +5,37 @@ import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from benchmarks import __main__ as benchmarks
 from benchmarks import long_roads
-from benchmarks.turns import Line, compare, take_turns
+from benchmarks.turns import compare, take_turns
 from tests.helpers import ROOT, SHORT
 
 
 def run(*words):
-    """Run a benchmark in the root of the checkout; return what it prints."""
-    command = [sys.executable, "-m", *map(str, words), "--quick"]
+    """Run the benchmarks in the root of the checkout; return what it prints."""
+    command = [sys.executable, "-m", "benchmarks", *map(str, words), "--quick"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def test_turns_alternate_and_set_up_is_off_the_clock(monkeypatch):
+def test_turns_alternate(monkeypatch):
     log = []
-    work = {"a": lambda: log.append("a") or 1, "b": lambda: log.append("b") or 2}
+    work = {name: (partial(log.append, name), n) for name, n in (("a", 1), ("b", 2))}
 
     def clock():
         log.append("clock")
         return float(len(log))
 
     monkeypatch.setattr("time.perf_counter", clock)
-    times = take_turns(work, 2, lambda: log.append("-"))
-    assert log == ["-", "clock", "a", "clock", "clock", "b", "clock"] * 3
+    times = take_turns(work, 2)
+    assert log == ["clock", "a", "clock", "clock", "b", "clock"] * 3
     assert {name: found.tolist() for name, found in times.items()} == {
         "a": [2e6] * 2, "b": [1e6] * 2,
     }  # fmt: skip
@@ -42,35 +44,40 @@ def test_turns_alternate_and_set_up_is_off_the_clock(monkeypatch):
 def test_a_ratio_pairs_the_turns_of_a_round():
     # The machine slows down by ten in the second round: the ratio stays.
     times = {"slow": np.array([2.0, 20.0, 2.2]), "fast": np.array([1.0, 10.0, 1.1])}
-    fast, slow = (line for line in compare(times, {"slow": "fast"})[::-1])
-    assert fast.ratio is None
-    assert (slow.time, slow.base) == (2.2, "fast")
-    assert slow.ratio.low == pytest.approx(2.0) == slow.ratio.high
+    assert compare(times, {"slow": "fast"}) == [
+        ["slow", "2.2", "2", "2 to 2", "fast"], ["fast", "1.1", "", "", ""],
+    ]  # fmt: skip
+
+
+def test_a_ratio_is_a_geometric_mean_with_the_interval_of_the_logarithms():
+    times = {"slow": np.exp([0.0, 1.0]), "fast": np.ones(2)}
+    half = 0.5 * stats.t.ppf(0.975, 1)  # the standard error is 0.5
+    low, high = np.exp([0.5 - half, 0.5 + half])
+    assert compare(times, {"slow": "fast"})[0][2:4] == ["1.65", f"{low:.3g} to {high:.3g}"]
 
 
 def test_a_part_that_fails_loses_nothing_of_the_others(tmp_path, monkeypatch, capsys):
-    def measure(part, quick):
-        return [Line(f"a step of {part}", 1.0)] if part != "environment" else {}[part]
+    def measure(part, args):
+        return [[f"a step of {part}", "1.0", "", "", ""]] if part != "environment" else {}[part]
 
     monkeypatch.setattr(benchmarks, "measure", measure)
     monkeypatch.setattr(benchmarks, "ProcessPoolExecutor", lambda *_: ThreadPoolExecutor(1))
-    path = tmp_path / "new" / "tables.md"
+    folder = tmp_path / "new"
     with pytest.raises(SystemExit, match=r"environment failed"):
-        benchmarks.main(benchmarks.Args(output=path))
-    for said in (capsys.readouterr().out, path.read_text(encoding="utf-8")):
+        benchmarks.main(benchmarks.Args(output=folder))
+    for said in (capsys.readouterr().out, (folder / "tables.md").read_text(encoding="utf-8")):
         assert re.findall(r"a step of (\w+)", said) == ["estimators", "learning", "long_roads"]
 
 
 def test_long_roads_have_settings_of_all_estimators():
-    lines = long_roads.measure(quick=True)
-    assert [line.base for line in lines] == [""] * 6 + [line.what for line in lines[:6]]
+    rows = long_roads.measure(quick=True)
+    assert [row[-1] for row in rows] == [""] * 6 + [row[0] for row in rows[:6]]
 
 
 @pytest.mark.slow
 def test_all_parts_run_and_write_one_table(tmp_path):
-    path = tmp_path / "new" / "tables.md"
-    printed = run("benchmarks", "--output", path)
-    written = path.read_text(encoding="utf-8")
+    printed = run("--output", tmp_path)
+    written = (tmp_path / "tables.md").read_text(encoding="utf-8")
     kinds = "EKF, filterpy", "MHE, qpsolvers", "libsumo alone", "road policy", "EKF, 21 segments"
     for name in kinds:
         assert name in printed
@@ -78,6 +85,6 @@ def test_all_parts_run_and_write_one_table(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_environments_are_compared():
+def test_two_environments_are_compared(tmp_path):
     other = f"{SHORT} {json.dumps({'bandwidth': 1})}"
-    assert "bandwidth" in run("benchmarks.turns", "--envs", SHORT, other)
+    assert "bandwidth" in run("--env", SHORT, other, "--output", tmp_path)
