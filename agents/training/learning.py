@@ -35,6 +35,12 @@ CLASSES: dict[str, Any] = {
 }
 """Classes of algorithms by their names."""
 
+PASSED = (
+    "batch_size", "gamma", "n_steps", "n_epochs", "gae_lambda", "buffer_size", "learning_starts",
+    "train_freq", "gradient_steps", "target_update_interval",
+)  # fmt: skip
+"""Hyperparameters that these take as they are."""
+
 
 def learn(run: Run) -> None:
     """Train to the end of the plan, from the last checkpoint on if there is one.
@@ -71,7 +77,7 @@ def learn(run: Run) -> None:
         # Episodes of a training that goes on are others.
         seed=training_seed(plan.seed) + len(run.rows) * settings.n_envs,
         device="cpu",
-        **settings.arguments(per_second),
+        **_arguments(settings, per_second),
     )
     if isinstance(settings, DQNSettings):
         model.exploration_schedule = lambda _: follow.exploration
@@ -92,6 +98,16 @@ def learn(run: Run) -> None:
         callbacks.append(ReplicaBaseline(settings.replicas))
     # The plan ends it, by time or by steps, and validations ask for the log.
     model.learn(sys.maxsize, callbacks, log_interval=None, reset_num_timesteps=False)
+
+
+def _arguments(settings: LearnerSettings, per_second: int) -> dict[str, Any]:
+    """Return keyword arguments of a class, whose steps are actions: so many are of a second."""
+    given = {name: getattr(settings, name) for name in PASSED if hasattr(settings, name)}
+    for name in {"gamma", "gae_lambda"} & set(given):
+        given[name] **= 1 / per_second
+    if isinstance(settings, PPOSettings):
+        given["n_steps"] *= per_second
+    return given
 
 
 def _network(

@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -26,9 +27,8 @@ from dptse_env.utils.validation import (
     Interval,
     checked_fields,
     from_mapping,
-    integer,
     parse_json,
-    positive,
+    read_toml,
     require,
     require_name,
 )
@@ -67,7 +67,7 @@ class World:
 
 @dataclass(frozen=True)
 class Algorithm:
-    """Settings that all algorithms share.
+    """Hyperparameters of all algorithms; ``hyperparameters.toml`` has values and what they are.
 
     Raises:
         ValueError: A value is out of range; the message names it.
@@ -77,17 +77,13 @@ class Algorithm:
     action: ClassVar[str]
     """Encoding of the actions."""
 
-    n_envs: Count = 128
-    """Episodes simulated at once."""
-    replicas: Count = 4
-    """Episodes in a group that shares traffic and noise (common random numbers)."""
+    n_envs: Count
+    replicas: Count
 
     def __post_init__(self) -> None:
-        """Check values."""
-        checked_fields(self, "algorithm")
-        divisible = self.n_envs % self.replicas == 0
-        allowed = f"a multiple of replicas {self.replicas}"
-        require(divisible, "algorithm.n_envs", allowed, self.n_envs)
+        """Check what `from_mapping` does not."""
+        divisible, allowed = self.n_envs % self.replicas == 0, f"a multiple of {self.replicas}"
+        require(divisible, "algorithm.n_envs", f"{allowed} replicas", self.n_envs)
 
     def fits(self, config: EnvConfig) -> bool:
         """Return whether it can choose the queries of an environment."""
@@ -110,58 +106,31 @@ class Algorithm:
 class Regression:
     """The regression of the estimate's squared errors (`agents.training.regression`)."""
 
-    rounds: Annotated[int, Interval(0, 99)] = 3
-    """Times that episodes are played and the network is fitted; 0 for no regression."""
-    seconds: Count = 700
-    """Seconds simulated in every episode of a round."""
-    interval: Count = 2
-    """Seconds between two samples of an episode."""
-    batches: Count = 1000
-    """Minibatches of a round."""
-    batch_size: Count = 1024
-    """Samples in a minibatch."""
-    rate: Positive = 1e-3
-    """Initial learning rate; it falls linearly to a twentieth."""
-    max_grad_norm: Positive = 0.5
-    """Norm to which longer gradients are clipped."""
-    sharpness: Positive = 4.0
-    """Factor from the logarithm of the expected squared error to the score."""
-    age_bonus: NonNegative = 0.3
-    """Bonus on that logarithm for every unit of the age channel, 6 s."""
-
-    def __post_init__(self) -> None:
-        """Check values."""
-        checked_fields(self, "algorithm.regression")
+    rounds: Annotated[int, Interval(0, 99)]
+    seconds: Count
+    interval: Count
+    batches: Count
+    batch_size: Count
+    rate: Positive
+    max_grad_norm: Positive
+    sharpness: Positive
+    age_bonus: NonNegative
 
 
 @dataclass(frozen=True)
 class SwapRounds:
     """Rounds of policy iteration with measured swaps (`agents.training.swaps`)."""
 
-    rounds: Annotated[int, Interval(0, 99)] = 8
-    """Number of rounds; 0 for none."""
-    episodes: Annotated[int, Interval(1, 9999)] = 160
-    """Episodes of a round, simulated at once."""
-    seconds: Count = 15
-    """Seconds over which the effect of a swap is measured, and between two states of an episode."""
-    trials: Count = 3
-    """Swaps tried in each state."""
-    step: Positive = 25.0
-    """Rise of a score, in the first round, for an expected gain of one mean one-second error."""
-    final_step: Positive = 5.0
-    """The same in the last round; it falls linearly, so that errors of the rounds average out."""
-    price: NonNegative = 0.128
-    """Penalty for the whole budget of a vehicle, in units of the mean one-second error."""
-    batches: Count = 600
-    """Minibatches of a round's fit."""
-    batch_size: Count = 1024
-    """Swaps in a minibatch."""
-    rate: Positive = 5e-4
-    """Initial learning rate of the fit; it falls to zero."""
-
-    def __post_init__(self) -> None:
-        """Check values."""
-        checked_fields(self, "algorithm.swaps")
+    rounds: Annotated[int, Interval(0, 99)]
+    episodes: Annotated[int, Interval(1, 9999)]
+    seconds: Count
+    trials: Count
+    step: Positive
+    final_step: Positive
+    price: NonNegative
+    batches: Count
+    batch_size: Count
+    rate: Positive
 
     def step_of(self, done: float) -> float:
         """Return the step of a round, by the fraction of the way to the last round."""
@@ -178,15 +147,12 @@ class PlackettLuceSettings(Algorithm):
     name: ClassVar[str] = "plackett-luce"
     action: ClassVar[str] = "slots"
 
-    width: Count = 32
-    """Features per segment of the scorer."""
-    regression: Regression = field(default_factory=Regression)
-    """The regression, which is round 0 of the training."""
-    swaps: SwapRounds = field(default_factory=SwapRounds)
-    """Rounds of swaps after the regression."""
+    width: Count
+    regression: Regression
+    swaps: SwapRounds
 
     def __post_init__(self) -> None:
-        """Check values."""
+        """Check what `from_mapping` does not."""
         super().__post_init__()
         some = self.swaps.rounds > 0 or self.regression.rounds > 0
         require(some, "algorithm.swaps.rounds", "above 0 where regression.rounds is 0", 0)
@@ -229,31 +195,19 @@ def first_second(horizon: int) -> int:
 
 @dataclass(frozen=True)
 class LearnerSettings(Algorithm):
-    """Settings of the algorithms of stable-baselines3 and sb3-contrib.
+    """Hyperparameters of the algorithms of stable-baselines3 and sb3-contrib."""
 
-    Their defaults hold for the rest. The defaults here are those of a perceptron, whose
-    observations `VecNormalize` scales.
-    """
-
-    horizon: Count = 300
-    """Longest episode [s]; at most half of a record. Episodes begin anywhere in their record."""
-    policy: Literal["road", "mlp"] = "mlp"
-    """`RoadPolicy`, whose weights all segments share, or a perceptron."""
-    hidden: tuple[Count, ...] = (64, 64)
-    """Units of a perceptron's hidden layers, in separate networks for actions and value."""
-    learning_rate: Positive = 5e-4
-    """Initial learning rate of Adam."""
-    final_learning_rate: NonNegative = 5e-5
-    """Final learning rate of Adam; it falls linearly."""
-    gamma: Discount = 0.9
-    """Discount of one second; where a decision takes several actions, its root is that of one."""
-    batch_size: Count = 1024
-    """Actions in a minibatch."""
-    validations: Annotated[int, Interval(1, 9999)] = 24
-    """Validations, each with a checkpoint, beside the one of the untrained policy."""
+    horizon: Count
+    policy: Literal["road", "mlp"]
+    hidden: tuple[Count, ...]
+    learning_rate: Positive
+    final_learning_rate: NonNegative
+    gamma: Discount
+    batch_size: Count
+    validations: Annotated[int, Interval(1, 9999)]
 
     def __post_init__(self) -> None:
-        """Check values."""
+        """Check what `from_mapping` does not."""
         super().__post_init__()
         is_road = self.policy == "road"
         require(not is_road or self.name == PPOSettings.name, "algorithm.policy", "mlp", "road")
@@ -273,13 +227,6 @@ class LearnerSettings(Algorithm):
         most = min(config.horizon_steps, config.corridor.conditions.duration // 2)
         return {"horizon": min(self.horizon, most), "random_start": True}
 
-    def arguments(self, actions_per_step: int) -> dict[str, Any]:
-        """Return the keyword arguments of the class that do not change in a training."""
-        return {
-            "batch_size": self.batch_size,
-            "gamma": self.gamma ** (1 / actions_per_step),
-        }
-
 
 @dataclass(frozen=True)
 class PPOSettings(LearnerSettings):
@@ -288,27 +235,11 @@ class PPOSettings(LearnerSettings):
     name: ClassVar[str] = "ppo"
     action: ClassVar[str] = "slots"
 
-    replicas: Count = 8
-    """Episodes in a group that shares traffic and noise; advantages are compared within it."""
-    n_steps: Count = 64
-    """Seconds of each episode between two updates."""
-    n_epochs: Count = 4
-    """Passes over the actions of an update."""
-    gae_lambda: Discount = 0.9
-    """Parameter lambda of generalised advantage estimation, as ``gamma``."""
-    ent_coef: NonNegative = 0.005
-    """Initial weight of the entropy."""
-    final_ent_coef: NonNegative = 0.005
-    """Final weight of the entropy; it changes linearly."""
-
-    def arguments(self, actions_per_step: int) -> dict[str, Any]:
-        """See `LearnerSettings`."""
-        return {
-            **super().arguments(actions_per_step),
-            "n_steps": self.n_steps * actions_per_step,
-            "n_epochs": self.n_epochs,
-            "gae_lambda": self.gae_lambda ** (1 / actions_per_step),
-        }
+    n_steps: Count
+    n_epochs: Count
+    gae_lambda: Discount
+    ent_coef: NonNegative
+    final_ent_coef: NonNegative
 
 
 @dataclass(frozen=True)
@@ -325,8 +256,7 @@ class RecurrentPPOSettings(PPOSettings):
 
     name: ClassVar[str] = "recurrent-ppo"
 
-    lstm: Count = 64
-    """Units of the LSTM, one for actions and one for the value."""
+    lstm: Count
 
 
 @dataclass(frozen=True)
@@ -336,37 +266,17 @@ class DQNSettings(LearnerSettings):
     name: ClassVar[str] = "dqn"
     action: ClassVar[str] = "sequential"
 
-    replicas: Count = 1
-    """Episodes in a group that shares traffic and noise."""
-    buffer_size: Count = 200_000
-    """Decisions in the replay buffer, which begins empty when a training goes on."""
-    learning_starts: Count = 20_000
-    """Decisions ahead of the first update."""
-    train_freq: Count = 8
-    """Seconds of each episode between two updates."""
-    gradient_steps: Count = 4
-    """Minibatches of an update."""
-    target_update_interval: Count = 20_000
-    """Decisions between two updates of the target network."""
-    exploration: Annotated[float, Interval(0.0, 1.0, open_low=True)] = 0.2
-    """Part of the training in which the rate of random actions falls, from 1."""
-    final_exploration: Annotated[float, Interval(0.0, 1.0)] = 0.03
-    """Rate of random actions after it."""
+    buffer_size: Count
+    learning_starts: Count
+    train_freq: Count
+    gradient_steps: Count
+    target_update_interval: Count
+    exploration: Annotated[float, Interval(0.0, 1.0, open_low=True)]
+    final_exploration: Annotated[float, Interval(0.0, 1.0)]
 
     def fits(self, config: EnvConfig) -> bool:
         """See `Algorithm`; values are of single queries, not of sets."""
         return config.queries.most_queries == 1
-
-    def arguments(self, actions_per_step: int) -> dict[str, Any]:
-        """See `LearnerSettings`."""
-        same = (
-            "buffer_size", "learning_starts", "train_freq", "gradient_steps",
-            "target_update_interval",
-        )  # fmt: skip
-        return {
-            **super().arguments(actions_per_step),
-            **{name: getattr(self, name) for name in same},
-        }
 
 
 @dataclass(frozen=True)
@@ -375,65 +285,50 @@ class QRDQNSettings(DQNSettings):
 
     name: ClassVar[str] = "qr-dqn"
 
-    quantiles: Count = 25
-    """Quantiles of the return of a query."""
+    quantiles: Count
 
 
-ALGORITHMS: dict[str, Algorithm] = {
+ALGORITHMS: dict[str, type[Algorithm]] = {
     each.name: each
     for each in (
-        PPOSettings(),
-        MaskablePPOSettings(),
-        RecurrentPPOSettings(),
-        DQNSettings(),
-        QRDQNSettings(),
-        PlackettLuceSettings(),
+        PPOSettings,
+        MaskablePPOSettings,
+        RecurrentPPOSettings,
+        DQNSettings,
+        QRDQNSettings,
+        PlackettLuceSettings,
     )
 }
-"""Algorithms by name, with their settings.
+"""Classes of hyperparameters by the name of the algorithm."""
 
-Those of PPO with a perceptron were chosen on `ShortHighway-v0` with one query a second, where the
-best rule errs by 95.3 (x 1000): 87.0 after eight minutes on one core, 96.5 without `VecNormalize`.
-"""
-
-ROAD = {"policy": "road", "learning_rate": 1e-3, "ent_coef": 0.01, "final_ent_coef": 0.0}
-"""Settings of PPO with a `RoadPolicy`, its default, that differ from those of a perceptron.
-
-On `PrivateHighway-v1` with one query a second, after 2.5 minutes: with the perceptron's settings
-1.2 +- 2.1 % below the best rule, with these and `ReplicaBaseline` 2.7 +- 1.8 %, and 5.6 +- 1.9 %
-after 17 minutes. On `ShortHighway-v0` 9.6 +- 1.0 % after five.
-"""
-
-LONG_ROAD = {"n_envs": 64, "horizon": 400, "n_steps": 32, "batch_size": 512, "n_epochs": 3}
-"""Settings of PPO that differ on a road of `LONG` segments or more, whose seconds cost more.
-
-On `LongHighway-v0` with two queries a second 4.3 +- 2.7 % below the best rule after eight minutes.
-"""
-
-LONG = 60
-"""Segments of a long road."""
+TABLE = Path(__file__).with_name("hyperparameters.toml")
+"""Their values."""
 
 
 def parse_algorithm(text: str, n_segments: int) -> Algorithm:
-    """Return an algorithm with its settings for a road.
+    """Return an algorithm with its hyperparameters for a road.
 
     Args:
-        text: ``name``, or ``name {JSON}`` of settings that differ.
+        text: ``name``, or ``name {JSON}`` of values that differ from the table's.
         n_segments: Mainline segments of the road.
 
     Raises:
-        ValueError: The name or a setting is unknown, or a value is out of range.
+        ValueError: The name or a hyperparameter is unknown, or a value is out of range.
     """
     name, _, settings = text.partition(" ")
     require_name("algorithm", name, ALGORITHMS)
-    tuned = ALGORITHMS[name]
     given = parse_json(settings, "algorithm") if settings.strip() else {}
     require(isinstance(given, dict), "algorithm", "a name and a JSON object", settings)
-    if name == PPOSettings.name and given.get("policy") != "mlp":
-        tuned = dataclasses.replace(tuned, **ROAD)  # type: ignore[arg-type]
-    if isinstance(tuned, PPOSettings) and n_segments >= LONG:
-        tuned = dataclasses.replace(tuned, **LONG_ROAD)  # type: ignore[arg-type]
-    return from_mapping(type(tuned), given, "algorithm", tuned)
+    tables = read_toml(TABLE, "table of hyperparameters")
+    values = tables[name]
+    values = {**tables[values.pop("like", name)], **values}
+    on_long, with_road = values.pop("long", {"segments": math.inf}), values.pop("road", {})
+    if given.get("policy", values.get("policy")) == "road":
+        values |= with_road
+    if n_segments >= on_long.pop("segments"):
+        values |= on_long
+    tuned = from_mapping(ALGORITHMS[name], values, "algorithm")
+    return from_mapping(ALGORITHMS[name], given, "algorithm", tuned)
 
 
 def fitting(config: EnvConfig) -> list[str]:
@@ -465,38 +360,29 @@ class TrainingPlan:
 
     envs: tuple[str, ...]
     algorithm: Algorithm
-    seed: int
+    seed: Annotated[int, Interval(0, TRAININGS - 1)]
     traffic_seeds: tuple[int, ...]
     validation_seeds: tuple[int, ...]
-    minutes: float | None = None
-    steps: int | None = None
+    minutes: Positive | None = None
+    steps: Count | None = None
     initial: str | None = None
 
     def __post_init__(self) -> None:
         """Check values that need no environment."""
-        integer("seed", self.seed, 0, TRAININGS - 1)
+        checked_fields(self, "")
         require(len(self.envs) > 0, "env", "one or more environments", self.envs)
         require_seeds("train_seeds", self.traffic_seeds, TRAINING_SEEDS)
         require_seeds("validation_seeds", self.validation_seeds, VALIDATION_SEEDS)
-        if self.minutes is not None:
-            positive("minutes", self.minutes)
-        if self.steps is not None:
-            integer("steps", self.steps, 1)
-        name = self.algorithm.name
+        name, policy = self.algorithm.name, getattr(self.algorithm, "policy", "")
         if isinstance(self.algorithm, LearnerSettings):
-            if (self.minutes is None) == (self.steps is None):
-                raise ValueError(
-                    f"minutes or steps must be given for {name}, one of them, got "
-                    f"{self.minutes} and {self.steps}"
-                )
-        elif self.steps is not None:
-            raise ValueError(
-                f"steps are not for {name}, which trains in rounds: give minutes, or set "
-                f"algorithm.swaps.rounds"
-            )
-        is_road = isinstance(self.algorithm, LearnerSettings) and self.algorithm.policy == "road"
+            given, allowed = [self.minutes, self.steps], f"one of the two for {name}"
+            require(None in given and given != [None, None], "minutes and steps", allowed, given)
+        else:
+            allowed = f"left out for {name}, which trains in rounds"
+            require(self.steps is None, "steps", allowed, self.steps)
         if self.initial is not None:
-            require(is_road, "initial", "left out but for ppo with a road policy", self.initial)
+            allowed = "left out but for ppo with a road policy"
+            require(policy == "road", "initial", allowed, self.initial)
             saved = read_policy(self.initial).card["policy"]["class"]
             require(saved == RoadPolicy.__name__, "initial", "a saved RoadPolicy", saved)
         for _, keywords in map(parse_env, self.envs):

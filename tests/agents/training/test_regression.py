@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from agents.training.regression import RULE, Practice, regress, squared_errors
-from agents.training.settings import Regression
+from agents.training.settings import parse_algorithm
 from dptse_env.sb3 import RoadPolicy, SB3VecEnv
 from tests.helpers import SHORT
 
@@ -22,7 +24,8 @@ def make(**changes):
     episodes.seed(1)
     torch.manual_seed(0)
     policy = RoadPolicy.from_config(env.config, width=8)
-    return Regression(**{**few, **changes}), Practice(policy, episodes, 64)
+    tuned = parse_algorithm("plackett-luce", 6).regression
+    return replace(tuned, **{**few, **changes}), Practice(policy, episodes, 64)
 
 
 def queried_variance(process):

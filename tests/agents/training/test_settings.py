@@ -27,7 +27,7 @@ def test_settings_that_are_given_replace_single_ones():
         'plackett-luce {"swaps": {"step": 9.0, "final_step": 1, "rounds": 5}}', 6
     )
     assert [given.swaps.step_of(k) for k in (0.0, 0.25, 1.0)] == [9.0, 7.0, 1.0]
-    assert given.regression == ALGORITHMS["plackett-luce"].regression
+    assert given.regression == parse_algorithm("plackett-luce", 6).regression
     road, mlp = parse_algorithm("ppo", 6), parse_algorithm('ppo {"policy": "mlp"}', 6)
     assert (road.policy, road.learning_rate, road.final_ent_coef) == ("road", 1e-3, 0.0)
     assert (mlp.policy, mlp.learning_rate, mlp.final_ent_coef) == ("mlp", 5e-4, 0.005)
@@ -41,7 +41,7 @@ def test_settings_that_are_given_replace_single_ones():
         ("ppo {", "algorithm must be JSON"),
         ('ppo {"gama": 0.9}', "algorithm.gama is unknown"),
         ('dqn {"gamma": 1.0}', r"algorithm.gamma must be .*\(0, 1\), got 1.0"),
-        ('ppo {"replicas": 3}', "algorithm.n_envs must be a multiple of replicas 3, got 128"),
+        ('ppo {"replicas": 3}', "algorithm.n_envs must be a multiple of 3 replicas, got 128"),
         ('recurrent-ppo {"policy": "road"}', "algorithm.policy must be mlp, got 'road'"),
         ('plackett-luce {"swaps": {"step": 0}}', "algorithm.swaps.step must be .*> 0, got 0"),
         (
@@ -131,11 +131,27 @@ def test_plans_that_are_refused(changes, message):
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        ("ppo", {"steps": None}, "minutes or steps must be given for ppo, one of them"),
-        ("ppo", {"minutes": 1.0, "steps": 9}, "minutes or steps must be given for ppo, one of"),
-        ("ppo", {"minutes": 0.0, "steps": None}, "minutes must be a finite number > 0, got 0"),
-        ("ppo", {"steps": 0}, "steps must be an integer >= 1, got 0"),
-        ("plackett-luce", {"steps": 3}, "not for plackett-luce, which trains in rounds"),
+        (
+            "ppo",
+            {"steps": None},
+            r"minutes and steps must be one of .* got \[None, None\]",
+        ),
+        (
+            "ppo",
+            {"minutes": 1.0, "steps": 9},
+            "minutes and steps must be one of the two for ppo",
+        ),
+        (
+            "ppo",
+            {"minutes": 0.0, "steps": None},
+            "minutes must be a finite number > 0 or None",
+        ),
+        ("ppo", {"steps": 0}, "steps must be an integer >= 1 or None, got 0"),
+        (
+            "plackett-luce",
+            {"steps": 3},
+            "steps must be left out for .*, which trains in rounds",
+        ),
         (
             "dqn",
             {"initial": "private-highway"},

@@ -1,5 +1,7 @@
 """Gains of swaps beside episodes that are run apart, and the moves of scores that they make."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,14 +11,15 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from agents.seeds import training_seed
-from agents.training.settings import SwapRounds
+from agents.training.settings import parse_algorithm
 from agents.training.swaps import LARGEST_GAIN, Swaps, raise_scores, try_swaps
 from dptse_env.config import resolve
 from dptse_env.sb3 import RoadPolicy
 from tests.helpers import SHORT
 
 SECONDS, TRIALS, HORIZON, SEED = 6, 2, 40, 1
-FEW = SwapRounds(seconds=SECONDS, trials=TRIALS)
+TUNED = parse_algorithm("plackett-luce", 6).swaps
+FEW = replace(TUNED, seconds=SECONDS, trials=TRIALS)
 PRIVACIES = {
     "capped": {"preset": "capped", "cap": 20, "boundary_inputs": "private"},
     "paced": {"preset": "paced", "boundary_inputs": "private"},
@@ -158,7 +161,7 @@ def test_without_budgets_nothing_is_spent():
 # --- the fit --------------------------------------------------------------------------------------
 
 STEP = 3.0
-FIT = SwapRounds(price=0.01, batches=400, batch_size=256, rate=1e-2)
+FIT = replace(TUNED, price=0.01, batches=400, batch_size=256, rate=1e-2)
 
 
 @pytest.fixture
