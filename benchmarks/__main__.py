@@ -26,23 +26,23 @@ from benchmarks.turns import HEADER, Row, compare, make_batch, stepping, take_tu
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.threads import n_cores
 from dptse_env.versions import versions_with
-from scripts.cli import Command, Environments, Output, run
+from scripts.cli import Command, Environments, run
 
 Part = Literal["estimators", "environment", "learning", "long_roads"]
 PACKAGES = ("libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(Output, Environments, Command):
-    """Measure, and print and write a table of each part."""
+class Args(Environments, Command):
+    """Measure and print a table of each part."""
 
     parts: tuple[Part, ...] = get_args(Part)
     """Parts to measure."""
     env: tuple[str, ...] = ()
     """Environments to compare with the first of them, in place of all parts: each an id, or an id
     and keywords as JSON, 'ID {"bandwidth": 3}'."""
-    output: Path = Path("results/benchmarks")
-    """Folder of the table, tables.md."""
+    output: Path | None = None
+    """Folder of one table of all parts, tables.md; none is written if not given."""
     quick: bool = False
     """Smallest sizes: whether it runs, not how fast it is."""
 
@@ -65,7 +65,6 @@ def main(args: Args) -> None:
     """
     versions = ", ".join(map(" ".join, versions_with(*PACKAGES).items()))
     title = f"Python {platform.python_version()}, {n_cores()} cores; {versions}"
-    args.output.mkdir(parents=True, exist_ok=True)
     measured: list[Row] = []
     failed: list[str] = []
     for part in ("environments",) if args.env else args.parts:
@@ -78,8 +77,10 @@ def main(args: Args) -> None:
             continue
         args.answer(rows, make_table(f"{part}: {title}", *HEADER, rows=rows))
         measured += rows
-        table = markdown(HEADER, measured, ":--", "--:")
-        write_atomically(args.output / "tables.md", f"# Time of a step\n\n{title}\n\n{table}\n")
+        if args.output is not None:
+            args.output.mkdir(parents=True, exist_ok=True)
+            table = f"# Time of a step\n\n{title}\n\n{markdown(HEADER, measured, ':--', '--:')}\n"
+            write_atomically(args.output / "tables.md", table)
     if failed:
         raise SystemExit(f"error: {', '.join(failed)} failed, see above")
 

@@ -85,6 +85,6 @@ def test_all_parts_run_and_write_one_table(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_environments_are_compared(tmp_path):
+def test_two_environments_are_compared():
     other = f"{SHORT} {json.dumps({'bandwidth': 1})}"
-    assert "bandwidth" in run("--env", SHORT, other, "--output", tmp_path)
+    assert "bandwidth" in run("--env", SHORT, other)
