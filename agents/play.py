@@ -103,6 +103,18 @@ class Cell:
             env.process  # noqa: B018 (an estimator refuses a road when it is made)
         self.load_policy(env)
 
+    def misfit(self) -> str | None:
+        """Return why the cell cannot be played, or None if it can.
+
+        Raises:
+            FileNotFoundError: There is no such policy.
+        """
+        try:
+            self.check()
+        except ValueError as problem:
+            return str(problem)
+        return None
+
     def load_policy(self, env: Any) -> Any:
         """Bind the policy to an environment.
 

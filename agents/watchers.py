@@ -143,7 +143,8 @@ class Honesty:
         spread = np.stack([estimate.density_std, estimate.speed_std], -1)[:, :n]
         counts = np.stack([np.ones_like(occupied), occupied], -1)
         error = np.where(counts, means - truth, 0.0)
-        ratio = np.abs(error) / spread
+        with np.errstate(divide="ignore"):  # an estimator of somebody's own may claim to be exact
+            ratio = np.divide(np.abs(error), spread, out=np.zeros_like(error), where=error != 0.0)
         self._cells += n
         self._occupied += occupied.sum(axis=1)
         self._chi2 += np.sum(ratio**2, axis=1)

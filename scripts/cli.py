@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import logging
@@ -67,6 +68,17 @@ class Command:
         """Print a line on what is going on, beside the result."""
         if not self.quiet:
             print(text, file=sys.stderr)
+
+    def require_unset(self, mode: str, *names: str) -> None:
+        """Refuse options that do not apply in a mode, such as ``with --suite``.
+
+        Raises:
+            ValueError: One of them is not at its default.
+        """
+        for option in dataclasses.fields(self):
+            if option.name in names and getattr(self, option.name) != option.default:
+                given = f"--{option.name.replace('_', '-')}"
+                raise ValueError(f"{given} does not apply {mode}")
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,11 @@ GONE = {
 
 RENAMED: dict[str, dict[str, str]] = {
     "audit": {},
-    "evaluate": {},
+    "evaluate": {
+        "--schedules": "--policies",
+        "--seeds": "--test-seeds",
+        "--noise-seed": "--seed",
+    },
     "fit": {
         "--training": "--train-seeds",
         "--validation": "--validation-seeds",

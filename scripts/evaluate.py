@@ -1,112 +1,185 @@
-r"""Compare query schedules and policies on the same traffic and noise.
+r"""Compare query policies and estimators on the same traffic and noise.
 
-dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --seeds 2000:2004 \
-    --schedules shift-ahead round-robin
+dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --test-seeds 2000:2004 \
+    --policies shift-ahead round-robin
 
-The error is minus 1,000 times the reward. Differences are paired by traffic and noise.
+Errors leave out the first 60 s of an episode. Differences are paired by traffic and noise.
+
+dptse evaluate --suite short --policies speed-front
+
+An entry to the query suite gets a card. Of several policies the first that suits a cell acts.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import polars as pl
 
-from agents.environments import make_config, parse_env
+from agents.environments import heading, make_config, parse_env
 from agents.figures import RoadMap, draw_bars, draw_errors, draw_maps, estimate_map, save_figure
+from agents.files import write_json
 from agents.page import watch, write_page
 from agents.play import Cell
 from agents.policies import NamedSchedule, find_policy, policy_name
 from agents.seeds import seed_kind
-from agents.statistics import Interval
-from agents.study import OWN, PARTS, ROWS, TABLES, Study, read_rows
+from agents.statistics import Interval, mean_interval
+from agents.studies import suite
+from agents.study import OWN, PARTS, ROWS, TABLES, Study, play_study, read_rows
 from agents.study import run as run_study
 from agents.tables import (
     DENSITY,
     ERROR,
     SPEED,
+    are_present,
     below,
-    difference,
     error_label,
     markdown,
-    mean,
     values,
 )
-from agents.terminal import make_table, print_table, print_text
+from agents.terminal import make_table
 from dptse_env.config import parse_seeds
+from dptse_env.evaluation import WARM_UP
 from dptse_env.policies import DETERMINISTIC
-from dptse_env.privacy import rounded_up
 from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import require_output
-from dptse_env.utils.validation import require
-from scripts.cli import Environment, Machines
+from dptse_env.utils.validation import require, require_name
+from scripts.cli import (
+    Command,
+    Environment,
+    Estimators,
+    Machines,
+    Policies,
+    Replacing,
+    Seed,
+    TestSeeds,
+)
 
 ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
 
 METRICS = (ERROR, DENSITY, SPEED)
-ERRORS, MAPS, PAGE = "schedules.png", "space_time.png", "page.html"
-"""Files of the figures and of the interactive page."""
+HONESTY = ("chi2_density", "chi2_speed")
+ERRORS, MAPS, PAGE, CARD = "errors.png", "space_time.png", "page.html", "card.json"
+"""Files of the figures, of the interactive page, and of an entry to the suite."""
+OUTPUT = Path("results/evaluation")
 
 
-@dataclass(frozen=True)
-class Args(Machines, Environment):
-    """Evaluate query schedules and policies."""
+@dataclass(frozen=True, kw_only=True)
+class Args(
+    Machines, Replacing, Seed, TestSeeds, Estimators, Policies, Environment, Command
+):  # fmt: skip
+    """Compare query policies and estimators."""
 
-    schedules: tuple[str, ...] = tuple(OBSERVATION_SCHEDULES)
-    """Schedules and oracles; 'all' has a bandwidth that covers the road."""
     policies: tuple[str, ...] = ()
-    """Saved policies by file or shipped name, or "module:Class"; dptse policy import converts
-    models of stable-baselines3."""
+    """Policies by name, file or "module:Class"; all rules if none."""
+    estimators: tuple[str, ...] = ()
+    """Estimators by name or "module:Class"; the environment's own if none."""
+    test_seeds: str = "2000:2008"
+    seed: int = 0
+    """Seeds noise and estimators, one stream for each traffic seed."""
+    reference: str = "round-robin"
+    """Policy that the others are compared with."""
     acts: Literal["deterministic", "drawn"] | None = None
-    """Let policies take their likeliest actions or draw them; as their cards say if not given."""
+    """Take likeliest actions, or draw them; else as policies say."""
     transfer: bool = False
     """Let policies act where they were not trained."""
-    estimators: tuple[str, ...] = ()
-    """State estimators; the environment's own if none is given."""
-    seeds: str = "2000:2008"
-    """Traffic seeds, first:stop, that nothing was trained on."""
-    reference: str = "round-robin"
-    """Schedule that the others are compared with."""
-    noise_seed: int = 0
-    """Seeds noise and estimators, one stream for each traffic seed."""
-    output: Path = Path("results/evaluation")
-    """Folder for tables, rows and figures."""
     html: bool = False
     """Also write an interactive page, page.html."""
-    force: bool = False
-    """Replace the files of an earlier evaluation."""
-    json: bool = False
-    """Print JSON, for a program, in place of tables."""
+    suite: tuple[str, ...] | None = None
+    """Play cells of the query suite; all if none is named."""
+    beside: tuple[Path, ...] = ()
+    """Cards of other entries to the suite."""
+    output: Path = OUTPUT
+    """Folder of the results; results/my-suite/NAME for an entry to the suite."""
+
+
+def main(args: Args) -> None:
+    """Compare policies, or let them enter the suite."""
+    if args.suite is None:
+        args.require_unset("without --suite", "beside")
+        compare(args)
+    else:
+        rest = "env", "estimators", "test_seeds", "seed", "reference", "acts", "transfer", "html"
+        args.require_unset("with --suite", *rest, "force")
+        enter(args, args.suite or tuple(suite.CELLS))
+
+
+def rows_of(cells: Sequence[Cell], rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows of cells by this version; a folder may have others, of earlier runs."""
+    return rows.filter(pl.col("cell").is_in([cell.id for cell in cells]), are_present(rows))
+
+
+# Comparisons.
 
 
 @dataclass(frozen=True)
 class Score:
-    """The errors of a policy with an estimator.
+    """The errors of a policy with an estimator; an interval of one episode is its point.
 
     Attributes:
-        means: By error.
-        differences: To the reference, paired by traffic and noise.
+        means: By error, and of the squared errors over their reported variances.
+        differences: By error, to the reference with this estimator, paired by traffic and noise.
     """
 
+    estimator: str
     policy: str
     means: Mapping[str, Interval]
     differences: Mapping[str, Interval]
 
+    @property
+    def error(self) -> float:
+        """The mean error."""
+        return self.means[ERROR].mean
 
-Scores = Mapping[str, Sequence[Score]]
-"""By estimator; the policy of the least error comes first."""
+
+def compare(args: Args) -> None:
+    """Record what is missing, evaluate, and write tables, rows and figures."""
+    title, cells = make_cells(args)
+    seeds = parse_seeds(args.test_seeds, "test_seeds")
+    title += f", {len(seeds)} episode{'s' * (len(seeds) > 1)} on {seed_kind(seeds)} traffic"
+    for cell in cells:
+        cell.check()
+    # The tables are written last: without them an evaluation goes on.
+    require_output(args.output, [TABLES], force=args.force)
+    figures = (ERRORS, MAPS, *([PAGE] if args.html else []))
+    require_output(args.output, figures, own=OWN, force=args.force)
+
+    def report(rows: pl.DataFrame, folder: Path) -> str:
+        scores = score(rows_of(cells, rows), cells, args.reference)
+        draw_scores(folder / ERRORS, title, scores, cells)
+        draw_traffic(args, title, scores, cells)
+        header, lines = make_rows(scores, args.reference)
+        table = markdown([each.replace("\n", " ") for each in header], lines)
+        return f"# {title}\n\n{legend(seeds)}.\n\n{table}"
+
+    place = args.place(args.output)
+    if args.force:
+        for name in (ROWS, TABLES, *figures):
+            (args.output / name).unlink(missing_ok=True)
+        shutil.rmtree(args.output / PARTS, ignore_errors=True)
+    run_study(Study("evaluation", cells, seeds, report), place)
+    rows = rows_of(cells, read_rows("evaluation", args.output))
+    scores = score(rows, cells, args.reference)
+    header, lines = make_rows(scores, args.reference)
+    table = make_table("", *header, left=2, rows=lines)
+    page = f", {PAGE} (for a browser)" if args.html else ""
+    args.answer(
+        {"title": title, "reference": args.reference, "rows": [as_json(each) for each in scores]},
+        f"{title}\n{legend(seeds)}", table, *verdicts(rows, scores, cells),
+        f"wrote {args.output}/: {TABLES}, {ERRORS} (errors), {MAPS} (queries){page}",
+    )  # fmt: skip
 
 
-def make_cells(args: Args) -> list[Cell]:
-    """Return a cell for each estimator and policy.
+def make_cells(args: Args) -> tuple[str, tuple[Cell, ...]]:
+    """Return the environment in words, and a cell for each estimator and policy.
 
     Raises:
         FileNotFoundError: There is no such saved policy.
@@ -116,11 +189,10 @@ def make_cells(args: Args) -> list[Cell]:
     if args.estimators:  # the environment's own may refuse its road
         given["estimator"] = args.estimators[0]
     config = make_config(env, given)
-    policies = {name: name for name in (*args.schedules, args.reference)}
-    for source in args.policies:
+    policies: dict[str, str] = {}
+    for source in (*(args.policies or OBSERVATION_SCHEDULES), args.reference):
         name = policy_name(source)
-        require(name not in policies, "policies", "of different names", name)
-        policies[name] = source
+        require(policies.setdefault(name, source) == source, "policies", "of other names", name)
     cells = []
     for estimator in args.estimators or (str(config.estimator),):
         own = {**given, "estimator": estimator} if args.estimators else given
@@ -132,48 +204,46 @@ def make_cells(args: Args) -> list[Cell]:
                     policy,
                     {**own, **more},
                     labels={"estimator": estimator, "policy": name},
-                    noise_seed=args.noise_seed,
+                    noise_seed=args.seed,
                     deterministic=None if args.acts is None else args.acts == DETERMINISTIC,
                     transferred=args.transfer,
+                    watchers=("honesty",),
                 )
             )
-    return cells
+    return heading(env, config), tuple(cells)
 
 
-def score(rows: pl.DataFrame, cells: Sequence[Cell], reference: str) -> Scores:
-    """Return the scores of cells; an interval of one episode is its point, with ``n`` 1."""
-    is_one = rows["traffic_seed"].n_unique() == 1
-
-    def compare(own: Mapping[str, str], against: Mapping[str, str], metric: str) -> Interval:
-        if not is_one:
-            return difference(rows, own, against, metric)
-        return point(values(rows, own, metric) - values(rows, against, metric))
-
-    scores: dict[str, list[Score]] = {}
+def score(rows: pl.DataFrame, cells: Sequence[Cell], reference: str) -> list[Score]:
+    """Return the scores of cells, by estimator; the least errors come first."""
+    scores = []
     for cell in cells:
-        own, against = cell.labels, {**cell.labels, "policy": reference}
-        means = {
-            each: point(values(rows, own, each)) if is_one else mean(rows, own, each)
-            for each in METRICS
+        own, other = cell.labels, {**cell.labels, "policy": policy_name(reference)}
+        means = {each: _interval(values(rows, own, each)) for each in (*METRICS, *HONESTY)}
+        differences = {
+            each: _interval(values(rows, own, each) - values(rows, other, each)) for each in METRICS
         }
-        differences = {each: compare(own, against, each) for each in METRICS}
-        found = scores.setdefault(own["estimator"], [])
-        found.append(Score(own["policy"], means, differences))
-    return {name: sorted(own, key=lambda s: s.means[ERROR].mean) for name, own in scores.items()}
+        scores.append(Score(own["estimator"], own["policy"], means, differences))
+    scores.sort(key=lambda each: each.error)
+    best = list(dict.fromkeys(each.estimator for each in scores))
+    return sorted(scores, key=lambda each: best.index(each.estimator))
 
 
-def point(values: FloatArray) -> Interval:
-    """Return a single value as an interval without length."""
-    (value,) = values.tolist()
-    return Interval(value, value, value, 1)
+def _interval(values: FloatArray) -> Interval:
+    """Return the mean of values with its interval, of length 0 where there is none."""
+    if len(values) > 1 and np.isfinite(values).all():
+        return mean_interval(values)
+    mean = float(values.mean())
+    return Interval(mean, mean, mean, 1)
 
 
 def as_json(score: Score) -> dict[str, Any]:
-    """Return a score as plain JSON; ends of an interval are null where it has none."""
+    """Return a score as plain JSON; null stands for ends of an interval that it has not."""
     content = dataclasses.asdict(score)
     for interval in (*content["means"].values(), *content["differences"].values()):
         if interval["n"] == 1:
             interval |= {"low": None, "high": None}
+        if not np.isfinite(interval["mean"]):
+            interval["mean"] = None
     return content
 
 
@@ -184,85 +254,96 @@ def in_words(interval: Interval, sign: str = "") -> str:
 
 
 def make_rows(scores: Sequence[Score], reference: str) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of the table of an estimator."""
-    header, rows = ["policy"], [[each.policy] for each in scores]
+    """Return header, folded, and rows of the table."""
+    header, rows = ["estimator", "policy"], [[each.estimator, each.policy] for each in scores]
+    name = policy_name(reference)
     for metric in METRICS:
-        header += [error_label(metric), f"against {reference}"]
+        header.append(error_label(metric).replace(" [", "\n["))
         for row, each in zip(rows, scores, strict=True):
-            own, less = each.means[metric], each.differences[metric]
-            row.append(in_words(own))
-            row.append("-" if each.policy == reference else in_words(less, "+"))
+            row.append(in_words(each.means[metric]))
+        if any(each.policy != name for each in scores):
+            header.append(f"against\n{name}")
+            for row, each in zip(rows, scores, strict=True):
+                less = in_words(each.differences[metric], "+")
+                row.append("-" if each.policy == name else less)
+    header.append("chi2 density,\nspeed")
+    for row, each in zip(rows, scores, strict=True):
+        row.append(", ".join(f"{each.means[name].mean:.2f}" for name in HONESTY))
     return header, rows
 
 
-def legend(scores: Scores) -> str:
-    """Return what the numbers of the tables are."""
-    n = next(iter(scores.values()))[0].means[ERROR].n
-    several = "mean ± half of the 95 % interval"
-    return several if n > 1 else "one episode has no interval: differences may be chance"
-
-
-def write_markdown(title: str, scores: Scores, reference: str) -> str:
-    """Return the tables as Markdown."""
-    parts = [f"# {title}", f"{legend(scores).capitalize()}."]
-    for estimator, own in scores.items():
-        parts += [f"## Estimator `{estimator}`", markdown(*make_rows(own, reference))]
-    return "\n\n".join(parts)
-
-
-def print_scores(title: str, scores: Scores, reference: str) -> None:
-    """Print a table for each estimator."""
-    print_text(f"{title}; {legend(scores)}")
-    for estimator, own in scores.items():
-        header, rows = make_rows(own, reference)
-        folded = [each.replace(" [", "\n[").replace("against ", "against\n") for each in header]
-        table = make_table(f"estimator {estimator}", *folded)
-        for row in rows:
-            table.add_row(*row)
-        print_table(table)
-
-
-def verdict(rows: pl.DataFrame, own: Sequence[Score], cells: Sequence[Cell]) -> str:
-    """Return how the best learned policy stands to the best rule, in a line; empty without one.
-
-    Args:
-        rows: Of the evaluation.
-        own: Scores with an estimator, the least error first.
-        cells: Of that estimator.
-    """
-    known = {cell.labels["policy"]: cell for cell in cells}
-    is_rule = {n: isinstance(find_policy(c.policy), NamedSchedule) for n, c in known.items()}
-    ranked = [each for each in own if each.policy != ALL and each.policy not in ORACLES]
-    learned = next((each for each in ranked if not is_rule[each.policy]), None)
-    rule = next((each for each in ranked if is_rule[each.policy]), None)
-    if learned is None or rule is None or learned.means[ERROR].n == 1:
-        return ""
-    gain = below(rows, known[learned.policy].labels, known[rule.policy].labels)
-    low, mean, high = gain.low, gain.mean, gain.high
-    side = "below"
-    if mean < 0.0:
-        low, mean, high, side = -high, -mean, -low, "above"
+def legend(seeds: Sequence[int]) -> str:
+    """Return what the numbers of the table are."""
+    several = "Mean ± half of the 95 % interval"
+    one = "One episode has no interval: differences may be chance"
     return (
-        f"learned ({learned.policy}) {learned.means[ERROR].mean:.1f}, "
-        f"best rule ({rule.policy}) {rule.means[ERROR].mean:.1f}: {mean:.1f} % {side}, "
-        f"95 % interval {low:.1f} to {high:.1f}, paired by traffic and noise"
+        f"{several if len(seeds) > 1 else one}. The first {WARM_UP} s of an episode are left out. "
+        "chi2 is the squared error over its reported variance, 1 of an honest estimator"
     )
 
 
-def draw_traffic(args: Args, title: str, scores: Scores, cells: Sequence[Cell]) -> None:
+def verdicts(rows: pl.DataFrame, scores: Sequence[Score], cells: Sequence[Cell]) -> list[str]:
+    """Return how the best learned policy stands to the best rule, a line for each estimator.
+
+    Args:
+        rows: Of the evaluation.
+        scores: The least error of an estimator first.
+        cells: What was played.
+    """
+    lines = []
+    for estimator in dict.fromkeys(each.estimator for each in scores):
+        learned, rules = _kinds([each for each in scores if each.estimator == estimator], cells)
+        if not learned or not rules or learned[0].means[ERROR].n == 1:
+            continue
+        best, rule = learned[0], rules[0]
+        own, other = ({"estimator": estimator, "policy": each.policy} for each in (best, rule))
+        gain = below(rows, own, other)
+        low, mean, high, side = gain.low, gain.mean, gain.high, "below"
+        if mean < 0.0:
+            low, mean, high, side = -high, -mean, -low, "above"
+        lines.append(
+            f"{estimator}: learned ({best.policy}) {best.error:.1f}, best rule ({rule.policy}) "
+            f"{rule.error:.1f}: {mean:.1f} % {side}, 95 % interval {low:.1f} to {high:.1f}"
+        )
+    return lines
+
+
+def _kinds(scores: Sequence[Score], cells: Sequence[Cell]) -> tuple[list[Score], list[Score]]:
+    """Return the scores of learned policies, and of rules that could be played in their place."""
+    sources = {cell.labels["policy"]: cell.policy for cell in cells}
+    rules = {name for name, each in sources.items() if isinstance(find_policy(each), NamedSchedule)}
+    return (
+        [each for each in scores if each.policy not in rules],
+        [each for each in scores if each.policy in rules - {ALL, *ORACLES}],
+    )
+
+
+def draw_scores(path: Path, title: str, scores: Sequence[Score], cells: Sequence[Cell]) -> None:
+    """Draw the errors of all policies."""
+    series: dict[str, dict[str, dict[str, Interval]]] = {}
+    for each in scores:
+        shown = {error_label(metric): each.means[metric] for metric in METRICS}
+        series.setdefault(each.estimator, {})[each.policy] = shown
+    first, *others = series.values()
+    learned, _ = _kinds(scores, cells)
+    lit = [each.policy for each in learned]
+    save_figure(draw_errors(list(first), series) if others else draw_bars(first, lit), path, title)
+
+
+def draw_traffic(args: Args, title: str, scores: Sequence[Score], cells: Sequence[Cell]) -> None:
     """Draw the first traffic seed under some policies, and write the page if it is wanted.
 
-    They are the reference, the best schedule and the best two policies.
+    They are the reference, the best other rule and the best two learned policies, with the
+    estimator of the least error.
     """
-    estimator, own = next(iter(scores.items()))
-    known = {cell.labels["policy"]: cell for cell in cells if cell.labels["estimator"] == estimator}
-    ranked = [each.policy for each in own if each.policy not in (args.reference, ALL)]
-    rules = [n for n in ranked if isinstance(find_policy(known[n].policy), NamedSchedule)]
-    learned = [name for name in ranked if name not in rules]
-    seed, records = parse_seeds(args.seeds)[0], args.records
+    own = [each for each in scores if each.estimator == scores[0].estimator]
+    known = {tuple(cell.labels.values()): cell for cell in cells}
+    reference = policy_name(args.reference)
+    learned, rules = ([e.policy for e in of if e.policy != reference] for of in _kinds(own, cells))
+    seed = parse_seeds(args.test_seeds)[0]
     episodes = [
-        watch(name, known[name], seed, records)
-        for name in (args.reference, *rules[:1], *learned[:2])
+        watch(name, known[own[0].estimator, name], seed, args.records)
+        for name in (reference, *rules[:1], *learned[:2])
     ]
     history = episodes[0].history
     maps = [RoadMap("true density", history.truth, history)]
@@ -270,75 +351,41 @@ def draw_traffic(args: Args, title: str, scores: Scores, cells: Sequence[Cell]) 
         maps.append(estimate_map(each.history, each.row[DENSITY], f"{each.name}: estimate"))
         maps.append(RoadMap(f"{each.name}: queried", each.history.queried, each.history))
     figure = draw_maps([maps], width=8.4)
-    save_figure(figure, args.output / MAPS, f"{title}: seed {seed}, {estimator}")
+    save_figure(figure, args.output / MAPS, f"{title}: seed {seed}, {own[0].estimator}")
     if args.html:
         errors = [
-            (each.policy, {m: (v.mean, v.half_width) for m, v in each.means.items()})
+            (each.policy, {m: (each.means[m].mean, each.means[m].half_width) for m in METRICS})
             for each in own
         ]
         write_page(args.output / PAGE, title, errors, episodes, seed)
 
 
-def make_title(cell: Cell, seeds: Sequence[int]) -> str:
-    """Return what is evaluated, in words, given one of the cells."""
-    config = make_config(cell.env, cell.keywords)
-    model = f"parameters {config.parameters.name}, release model {config.privacy.preset}"
-    epsilon, delta = config.privacy.epsilon, config.privacy.delta
-    privacy = f"epsilon {rounded_up(epsilon)}, delta {rounded_up(delta)}"
-    traffic = f"{len(seeds)} episode{'s' * (len(seeds) > 1)} on {seed_kind(seeds)} traffic"
-    return f"{cell.env.rpartition('/')[2]}, {model} ({privacy}), {traffic}"
+# The suite.
 
 
-def main(args: Args) -> None:
-    """Record what is missing, evaluate, and write tables, rows and figures."""
-    cells, seeds = make_cells(args), parse_seeds(args.seeds)
-    for cell in cells:
-        cell.check()
-    # The tables are written last: without them an evaluation goes on.
-    require_output(args.output, [TABLES], force=args.force)
-    figures = (ERRORS, MAPS, *([PAGE] if args.html else []))
-    require_output(args.output, figures, own=OWN, force=args.force)
-    title, ids = make_title(cells[0], seeds), {cell.id for cell in cells}
-
-    def report(rows: pl.DataFrame, folder: Path) -> str:
-        # An interrupted evaluation may have left rows of other cells.
-        scores = score(rows.filter(pl.col("cell").is_in(ids)), cells, args.reference)
-        series = {
-            name: {
-                each.policy: {error_label(metric): mean for metric, mean in each.means.items()}
-                for each in own
-            }
-            for name, own in scores.items()
-        }
-        first, *others = series.values()
-        names = {cell.labels["policy"]: cell.policy for cell in cells}
-        learned = [n for n in first if not isinstance(find_policy(names[n]), NamedSchedule)]
-        figure = draw_errors(list(first), series) if others else draw_bars(first, learned)
-        save_figure(figure, folder / ERRORS, title)
-        draw_traffic(args, title, scores, cells)
-        return write_markdown(title, scores, args.reference)
-
-    place = args.place(args.output)
-    if args.force:
-        for name in (ROWS, TABLES, *figures):
-            (args.output / name).unlink(missing_ok=True)
-        shutil.rmtree(args.output / PARTS, ignore_errors=True)
-    run_study(Study("evaluation", tuple(cells), seeds, report), place)
-    rows = read_rows("evaluation", args.output).filter(pl.col("cell").is_in(ids))
-    scores = score(rows, cells, args.reference)
-    if args.json:
-        played = [
-            {"estimator": estimator, **as_json(each)}
-            for estimator, own in scores.items()
-            for each in own
-        ]
-        found = {"title": title, "reference": args.reference, "rows": played}
-        print(json.dumps(found, indent=2))
-        return
-    print_scores(title, scores, args.reference)
-    for estimator, own in scores.items():
-        said = verdict(rows, own, [c for c in cells if c.labels["estimator"] == estimator])
-        if said:
-            print(said)
-    page = f", {PAGE} (for a browser)" if args.html else ""
-    print(f"wrote {args.output}/: {TABLES}, {ERRORS} (errors), {MAPS} (queries){page}")
+def enter(args: Args, names: Sequence[str]) -> None:
+    """Play what was entered in cells of the suite, write its card, and print scores."""
+    require(bool(args.policies), "policies", "given with --suite", args.policies)
+    others = [suite.read_card(path) for path in args.beside]
+    for name in names:
+        require_name("suite", name, list(suite.CELLS))
+    cells, left_out = suite.enter(args.policies, names)
+    entry = str(cells[0].labels["policy"])
+    # A schedule by "module:Class" has a character that not every system allows in a path.
+    own_folder = Path("results/my-suite") / entry.replace(":", "-")
+    folder = own_folder if args.output == OUTPUT else args.output
+    require_output(folder, own=OWN)
+    place, recorded = args.place(folder), suite.recorded_rows()
+    if left_out:
+        args.remark(left_out)
+    study = Study("suite", cells, suite.SEEDS, lambda rows, folder: "")
+    # The folder may have rows of this policy under another name.
+    own = rows_of(cells, play_study(study, place)).with_columns(policy=pl.lit(entry))
+    rows: pl.DataFrame = pl.concat([recorded, *others, own], how="diagonal_relaxed")
+    rows = rows.unique(("policy", "name", "traffic_seed"), keep="last")
+    card = suite.make_card(rows, entry, cells)
+    write_json(folder / CARD, card)
+    shown = [entry, *(each["policy"][0] for each in others)]
+    header, lines = suite.beside_rules(rows, shown)
+    title = f"{suite.NAME}: {suite.ZERO} has 0, {suite.ONE} has 1"
+    args.answer(card, make_table(title, *header, rows=lines), f"the card is {folder / CARD}")

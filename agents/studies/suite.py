@@ -151,12 +151,29 @@ def learned_cells() -> list[Cell]:
     return [make_cell(name, each, each) for name, each in product(CELLS, shipped_policies())]
 
 
-def _fits(learned: Cell) -> bool:
-    try:
-        learned.check()
-    except ValueError:  # what a policy says that does not act on this road or with this privacy
-        return False
-    return True
+def enter(policies: Sequence[str], names: Sequence[str]) -> tuple[tuple[Cell, ...], str]:
+    """Return cells with the first policy that suits each, and which are left out, and why.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: One of the policies acts in no cell.
+    """
+    entry = "+".join(map(policy_name, policies))
+    reasons = dict.fromkeys(policies, "those before it act in all cells")
+    found: dict[str, Cell] = {}
+    for name, source in product(names, policies):
+        made = make_cell(name, entry, source)
+        if name not in found and (problem := made.misfit()) is None:
+            found[name] = made
+        elif name not in found:
+            reasons[source] = reasons[name] = str(problem)
+    acting = {each.policy for each in found.values()}
+    for source in policies:
+        if source not in acting:
+            raise ValueError(f"{source!r} acts in no cell: {reasons[source]}")
+    missing = [name for name in names if name not in found]
+    why = f"{entry} does not suit {', '.join(missing)}: {reasons[missing[0]]}" if missing else ""
+    return tuple(found.values()), why
 
 
 def recorded_rows() -> pl.DataFrame:
@@ -286,6 +303,19 @@ def best_rule(rows: pl.DataFrame, name: str) -> str:
     return min(played, key=lambda rule: mean(rows, _labels(rule, name), ERROR).mean)
 
 
+def beside_rules(rows: pl.DataFrame, policies: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows of a table of scores by cell, with the best rule and the room."""
+    scores = score_all(rows)
+    columns = {policy: format_scores(each) for policy, each in scores.items()}
+    best = [next(policy for policy in scores if policy in RULES)]
+    best += [best_rule(rows, name) for name in CELLS]
+    rules = [f"{rule} {columns[rule][place]}" for place, rule in enumerate(best)]
+    rooms = ["", *(f"{room(rows, name).mean:.1f} %" for name in CELLS)]
+    shown = [columns[policy] for policy in policies]
+    lines = zip(["mean", *CELLS], *shown, rules, rooms, strict=True)
+    return ["cell", *policies, "best rule", f"{ONE} below best rule"], [list(x) for x in lines]
+
+
 def room(rows: pl.DataFrame, name: str) -> Interval:
     """Return by how much the gain oracle lies below the best rule in a cell [%], paired.
 
@@ -359,7 +389,7 @@ def read_card(path: Path) -> pl.DataFrame:
         raise FileNotFoundError(f"{path} is not there")
     card = parse_json(path.read_text(encoding="utf-8"), str(path))
     if not isinstance(card, dict) or not {*comparable(), "policy", "errors"} <= card.keys():
-        raise ValueError(f"{path} must be a card that 'dptse suite' wrote")
+        raise ValueError(f"{path} must be a card that 'dptse evaluate --suite' wrote")
     for key, own in comparable().items():
         if card[key] != own and (key != "package" or numbers_of(f"{card[key]}") != numbers_of(own)):
             raise ValueError(
@@ -490,5 +520,5 @@ STUDY = Study(
     rule_cells(),
     SEEDS,
     report,
-    follow=lambda rows, place: [each for each in learned_cells() if _fits(each)],
+    follow=lambda rows, place: [each for each in learned_cells() if each.misfit() is None],
 )

@@ -307,10 +307,6 @@ FILES = {
         "d.txt", b"1 2 3\n4 5 6\n",
         ["import", "field", *FIELD, *FIELD_ROAD, "--density", "{path}", "--speed", "{path}"],
     ),
-    "replayed field": (
-        "d.txt", b"1 2 3\n4 5 6\n",
-        ["replay-field", *FIELD, "--density", "{path}", "--speed", "{path}"],
-    ),
     "configuration": (
         "a.sumocfg", NETWORK, ["import", "network", "--path", "a b", "--configuration", "{path}"],
     ),
@@ -323,10 +319,10 @@ FILES = {
 
 FAST = [
     ("road", "missing"), ("policy", "truncated"), ("weights", "noise"), ("net", "folder"),
-    ("trajectories", "truncated"), ("replayed field", "folder"),
+    ("trajectories", "truncated"), ("field", "folder"),
 ]  # fmt: skip
 ALL = [(kind, how) for kind in FILES for how in ("missing", "folder", "noise", "truncated")]
-OUTPUTS = {"replay-field": [], "record": ["--records", "cache"], "network": ["--output", "o.toml"]}
+OUTPUTS = {"record": ["--records", "cache"], "network": ["--output", "o.toml"]}
 
 
 @pytest.mark.parametrize(("kind", "how"), fast_and_slow(ALL, FAST))

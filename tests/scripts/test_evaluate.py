@@ -4,6 +4,7 @@ import errno
 import json
 import signal
 import warnings
+from itertools import groupby
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,8 +14,10 @@ from PIL import Image
 
 from agents import study
 from agents.study import read_rows
+from dptse_env.estimators.simple import RandomWalk
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import load_policy
+from dptse_env.schedules import OBSERVATION_SCHEDULES
 from scripts import evaluate as evaluate_script
 from scripts.evaluate import Args, make_cells
 from tests.helpers import SHORT, save_untrained
@@ -31,7 +34,7 @@ def rows_of(folder, policy=None):
 
 
 def test_tables_rows_figures_and_json_agree(tmp_path):
-    words = ["--env", WALK, "--seeds", "2000:2002", "--schedules", "none", "--workers", "1"]
+    words = ["--env", WALK, "--test-seeds", "2000:2002", "--policies", "none", "--workers", "1"]
     words += ["--output", tmp_path / "out"]
     done = run_command("evaluate", *words, "--html")
     assert done.returncode == 0, done.stderr
@@ -48,14 +51,18 @@ def test_tables_rows_figures_and_json_agree(tmp_path):
             "error": -1000.0 * own["reward"].mean(),
             "rmse_density": own["rmse_density"].mean(),
             "rmse_speed": own["rmse_speed"].mean(),
+            "chi2_density": own["chi2_density"].mean(),
+            "chi2_speed": own["chi2_speed"].mean(),
         }
         means[row["policy"]] = expected
         assert {k: v["mean"] for k, v in row["means"].items()} == pytest.approx(expected)
-        line = next(each for each in tables.splitlines() if each.startswith(f"| {row['policy']} "))
-        places = [line.index(f"| {value:.2f} ±") for value in expected.values()]
+        start = f"| random_walk | {row['policy']} "
+        line = next(each for each in tables.splitlines() if each.startswith(start))
+        errors, chi2 = [*expected.values()][:3], [*expected.values()][3:]
+        places = [line.index(f"| {value:.2f} ±") for value in errors]
         assert places == sorted(places)
-        for value in expected.values():
-            assert f"{value:.2f} ±" in done.stdout
+        told = [f"{value:.2f} ±" for value in errors] + [", ".join(f"{x:.2f}" for x in chi2)]
+        assert all(each in done.stdout and each in line for each in told)
     (other,) = (row for row in found["rows"] if row["policy"] == "none")
     for metric, interval in other["differences"].items():
         less = means["none"][metric] - means["round-robin"][metric]
@@ -64,7 +71,7 @@ def test_tables_rows_figures_and_json_agree(tmp_path):
     assert [row["policy"] for row in found["rows"]] == sorted(
         means, key=lambda n: means[n]["error"]
     )
-    for name in ("schedules.png", "space_time.png"):
+    for name in ("errors.png", "space_time.png"):
         with Image.open(tmp_path / "out" / name) as image:
             assert image.format == "PNG"
     assert "page.html" in done.stdout
@@ -72,7 +79,7 @@ def test_tables_rows_figures_and_json_agree(tmp_path):
 
 
 def test_one_episode_has_no_interval(tmp_path):
-    words = ["--env", WALK, "--seeds", "2000", "--schedules", "none", "--workers", "1"]
+    words = ["--env", WALK, "--test-seeds", "2000", "--policies", "none", "--workers", "1"]
     words += ["--output", tmp_path]
     found = json.loads(run_command("evaluate", *words, "--json").stdout)
     (reward,) = rows_of(tmp_path, "none")["reward"]
@@ -90,8 +97,8 @@ def test_one_episode_has_no_interval(tmp_path):
 def test_it_goes_on_wherever_it_was_ended(tmp_path, monkeypatch):
     out, played, play_cell = tmp_path / "out", [], study._play_cell
     env = f'{SHORT} {{"estimator": "random_walk", "horizon": 64}}'
-    words = ["evaluate", "--env", env, "--seeds", "2000:2002", "--schedules", "none", "shift-ahead"]
-    words += ["--workers", "1", "--output", out]
+    words = ["evaluate", "--env", env, "--test-seeds", "2000:2002", "--workers", "1"]
+    words += ["--policies", "none", "shift-ahead", "--output", out]
 
     def play_two(*given):
         played.append(given)
@@ -123,13 +130,13 @@ def test_it_goes_on_wherever_it_was_ended(tmp_path, monkeypatch):
     assert not (out / "tables.md").exists()
     assert run_command(*words).returncode == 0
     assert len(played) == 4
-    names = {"rows.parquet", "schedules.png", "space_time.png", "tables.md"}
+    names = {"rows.parquet", "errors.png", "space_time.png", "tables.md"}
     assert {path.name for path in out.iterdir()} == names
     assert signal.getsignal(signal.SIGTERM) == handler
     with monkeypatch.context() as patch:  # what is begun anew, the old results do not describe
         patch.setattr(evaluate_script, "draw_traffic", interrupt)
         assert "begins anew" in run_command(*words, "--force").stderr
-    assert {path.name for path in out.iterdir()} == {"rows.parquet", "schedules.png"}
+    assert {path.name for path in out.iterdir()} == {"rows.parquet", "errors.png"}
     assert len(played) == 7
 
 
@@ -137,7 +144,7 @@ def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):
     road = tmp_path / "road.toml"
     road.write_text("n_mainline = 4\nduration = 62\n[demand]\nmainline = [[0, 1500]]\n")
     env = f'dptse_env:dptse/PaperHighway-v0 {{"corridor": "{road}", "bandwidth": 2}}'
-    words = ["--env", env, "--seeds", "2000", "--schedules", "none", "--workers", "1"]
+    words = ["--env", env, "--test-seeds", "2000", "--policies", "none", "--workers", "1"]
     words += ["--records", tmp_path / "records", "--output", tmp_path / "out"]
     with warnings.catch_warnings():
         warnings.simplefilter("always")
@@ -150,8 +157,8 @@ def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):
 def test_policies_and_schedules_play_what_gym_make_makes(tmp_path):
     path = save_untrained(tmp_path / "run" / "best.safetensors")
     done = run_command(
-        "evaluate", "--env", SHORT, "--schedules", "oldest-first", "--policies", path, "--seeds",
-        "999:1001", "--noise-seed", "5", "--output", tmp_path / "out", "--workers", "1",
+        "evaluate", "--env", SHORT, "--policies", "oldest-first", path, "--test-seeds",
+        "999:1001", "--seed", "5", "--output", tmp_path / "out", "--workers", "1",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "2 episodes on mixed traffic" in done.stdout
@@ -168,31 +175,70 @@ def test_policies_and_schedules_play_what_gym_make_makes(tmp_path):
     assert f": {abs(gain):.1f} % {side}, 95 % interval" in done.stdout
 
 
+def test_estimators_come_in_the_order_of_their_errors(tmp_path):
+    words = ["--env", SHORT, "--test-seeds", "2000:2002", "--workers", "1", "--output", tmp_path]
+    words += ["--policies", "round-robin", "none", "--estimators", "random_walk", "ekf", "--json"]
+    rows = json.loads(run_command("evaluate", *words).stdout)["rows"]
+    errors = {(row["estimator"], row["policy"]): row["means"]["error"]["mean"] for row in rows}
+    by_estimator = [[*own] for _, own in groupby(errors, key=lambda label: label[0])]
+    assert len(by_estimator) == 2
+    for own in by_estimator:
+        assert errors[own[0]] < errors[own[1]]
+    assert min(errors, key=errors.get) == by_estimator[0][0]
+    for (estimator, policy), row in zip(errors, rows, strict=True):
+        less = errors[estimator, policy] - errors[estimator, "round-robin"]
+        assert row["differences"]["error"]["mean"] == pytest.approx(less)
+
+
+class Sure(RandomWalk):
+    """An estimator that claims to be exact."""
+
+    def _estimate(self):
+        said = super()._estimate()
+        return said._replace(density_std=0.0 * said.density, speed_std=0.0 * said.speed)
+
+
+def test_an_estimator_may_claim_to_be_exact(tmp_path):
+    words = ["--env", SHORT, "--test-seeds", "2000:2002", "--workers", "1", "--output", tmp_path]
+    words += ["--policies", "round-robin", "--estimators", f"{__name__}:Sure"]
+    done = run_command("evaluate", *words)
+    assert done.returncode == 0, done.stderr
+    assert "inf, inf" in done.stdout
+    assert "against" not in done.stdout  # there is nothing to compare
+    (row,) = json.loads(run_command("evaluate", *words, "--force", "--json").stdout)["rows"]
+    assert row["means"]["chi2_speed"] == {"mean": None, "low": None, "high": None, "n": 1}
+
+
 def test_estimators_and_keywords_reach_the_environment():
     env = f'{SHORT} {{"privacy": {{"preset": "capped", "cap": 9}}, "bandwidth": 1}}'
-    args = Args(env=env, schedules=("random", "all"), estimators=("ukf", "ekf"))
-    cells = make_cells(args)
+    args = Args(env=env, policies=("random", "all"), estimators=("ukf", "ekf"))
+    title, cells = make_cells(args)
+    assert "privacy.cap 9, bandwidth 1" in title
     keywords = [cell.keywords for cell in cells]
     assert [each["estimator"] for each in keywords] == ["ukf"] * 3 + ["ekf"] * 3
     assert [each["bandwidth"] for each in keywords] == [1, 6, 1] * 2
     assert all(each["privacy"] == {"preset": "capped", "cap": 9} for each in keywords)
-    (own,) = make_cells(Args(env=SHORT, schedules=()))
+    _, (own,) = make_cells(Args(env=SHORT, policies=("round-robin",)))
     assert own.keywords == {}
     assert own.labels == {"estimator": "ekf", "policy": "round-robin"}
+    _, rules = make_cells(Args(env=SHORT))
+    assert {cell.policy for cell in rules} == {*OBSERVATION_SCHEDULES}
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--schedules", "best"], "schedule must be one of"),
+        (["--policies", "best"], "schedule must be one of"),
+        (["--reference", "nobody"], "'nobody'"),
         (["--estimators", "kf"], "estimator must be one of"),
         # The first could be played.
         (["--env", SURE, "--estimators", "ekf", "mhe"], "estimator_settings.process_noise[0] must"),
-        (["--seeds", "2000:2000"], "seeds must be"),
+        (["--test-seeds", "2000:2000"], "test_seeds must be"),
         (["--policies", "a/b.safetensors", "c/a/b.safetensors"], "'a/b'"),
         (["--policies", "nobody.safetensors"], "nobody.safetensors"),
         (["--policies", "nobody"], "'nobody'"),
         (["--env", f'{SHORT} {{"horizon": 60}}'], "horizon or the road's duration must be above"),
+        (["--beside", "card.json"], "--beside does not apply without --suite"),
     ],
 )
 def test_bad_arguments_are_named_and_nothing_is_written(words, message, tmp_path):

@@ -11,10 +11,10 @@ import pytest
 
 from agents.environments import parse_env
 from dptse_env.traffic import Demand, RecordLibrary, read_corridor
-from tests.agents.test_measured_field import source
 from tests.helpers import ROOT, make_env
 from tests.importers.data import STRAIGHT, driven, plain, stream, write_csv
 from tests.importers.sumo_net.conftest import PATH, motorway, netconvert
+from tests.importers.test_fields import write
 from tests.importers.test_tables import FOOT, ngsim
 from tests.scripts.commands import refused, run_command
 
@@ -199,11 +199,11 @@ def test_the_page_on_own_data_goes_on_to_a_policy(fifteen_minutes, monkeypatch):
     ],
 )
 def test_a_field_says_what_comes_next_or_what_is_missing_for_it(more, missing, next_ones, tmp_path):
-    field = source(tmp_path, columns=60)
+    field = write(tmp_path, intervals=60)
     printed = run(
         "field", "--density", field.density, "--speed", field.speed, "--cell", "0.05",
         "--interval", "5", "--density-unit", "veh/ft", "--speed-unit", "ft/s", "--name", "mine",
-        "--segments", "3", "--lanes", "5", "--speed-limit", "50", *more,
+        "--segments", "3", "--lanes", "5", "--speed-limit", "110", *more,
         "--output", tmp_path / "new",
     )  # fmt: skip
     road = (tmp_path / "new" / "road.toml").as_posix()

@@ -14,12 +14,12 @@ pytestmark = pytest.mark.usefixtures("small")
 
 def test_a_policy_gets_a_card_and_its_scores_beside_another_card(tmp_path):
     words = "--output", tmp_path / "mine", "--workers", "1"
-    done = run_command("suite", "random", *words)
+    done = run_command("evaluate", "--suite", "--policies", "random", *words)
     assert done.returncode == 0, done.stderr
     card = json.loads((tmp_path / "mine" / "card.json").read_text())
     assert card["scores"].keys() == SMALL.keys()
     words = "--beside", tmp_path / "mine/card.json", "--output", tmp_path / "other"
-    done = run_command("suite", "static", *words, "--workers", "1")
+    done = run_command("evaluate", "--suite", "--policies", "static", *words, "--workers", "1")
     (line,) = (line for line in done.stdout.splitlines() if line.strip().startswith("mean"))
     assert f"{card['score']['mean']:.2f} ±" in line
 
@@ -27,11 +27,11 @@ def test_a_policy_gets_a_card_and_its_scores_beside_another_card(tmp_path):
 def test_the_first_policy_that_suits_a_cell_acts_in_it(tmp_path):
     saved = save_untrained(tmp_path / "run" / "best.safetensors", estimator="random_walk")
     words = "--output", tmp_path / "out", "--workers", "1"
-    done = run_command("suite", saved, *words)
+    done = run_command("evaluate", "--suite", "--policies", saved, *words)
     assert "run/best does not suit paced: policy" in done.stderr
     card = json.loads((tmp_path / "out" / "card.json").read_text())
     assert (card["scores"].keys(), card["score"]) == ({"plain"}, None)
-    done = run_command("suite", saved, "static", *words)
+    done = run_command("evaluate", "--suite", "--policies", saved, "static", *words)
     assert done.returncode == 0, done.stderr
     card = json.loads((tmp_path / "out" / "card.json").read_text())
     assert card["score"] is not None
@@ -43,14 +43,16 @@ def test_the_first_policy_that_suits_a_cell_acts_in_it(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("nobody.safetensors",), "nobody.safetensors"),
-        (("nobody",), "'nobody'"),
-        (("static", "nobody"), "'nobody' acts in no cell"),
-        (("static", "--beside", "nobody.json"), "nobody.json"),
-        (("static", "--cells", "none"), "cells must be one of"),
-        ((), "policies must be one or more"),
+        (("--policies", "nobody.safetensors"), "nobody.safetensors"),
+        (("--policies", "nobody"), "'nobody'"),
+        (("--policies", "static", "nobody"), "'nobody' acts in no cell"),
+        (("--policies", "static", "--beside", "nobody.json"), "nobody.json"),
+        (("none", "--policies", "static"), "suite must be one of"),
+        ((), "policies must be given with --suite"),
+        (("--test-seeds", "2000"), "--test-seeds does not apply with --suite"),
+        (("--estimators", "ekf"), "--estimators does not apply with --suite"),
     ],
 )
 def test_bad_input_is_named_before_anything_is_played(words, message, tmp_path):
-    assert message in refused("suite", *words, "--output", tmp_path / "out")
+    assert message in refused("evaluate", "--suite", *words, "--output", tmp_path / "out")
     assert not (tmp_path / "out").exists()
