@@ -70,7 +70,7 @@ class Command:
             print(text, file=sys.stderr)
 
     def require_unset(self, mode: str, *names: str) -> None:
-        """Refuse options that do not apply in a mode, such as ``with --suite``.
+        """Refuse options that do not apply in a mode, such as ``with --tune``.
 
         Raises:
             ValueError: One of them is not at its default.
@@ -78,7 +78,7 @@ class Command:
         for option in dataclasses.fields(self):
             if option.name in names and getattr(self, option.name) != option.default:
                 given = f"--{option.name.replace('_', '-')}"
-                raise ValueError(f"{given} does not apply {mode}")
+                raise ValueError(f"{given} must be left out {mode}")
 
 
 @dataclass(frozen=True)

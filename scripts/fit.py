@@ -112,18 +112,14 @@ OF_TUNE = "also", "seed", "force"
 def main(args: Args) -> None:
     """Fit a road, or tune settings."""
     integer("trials", args.trials, 1)
-    for name in OF_FIT if args.tune else OF_TUNE:
-        given, option = getattr(args, name), f"--{name.replace('_', '-')}"
-        if given != getattr(Args, name):
-            raise ValueError(
-                f"{option} must be left out {'with' if args.tune else 'without'} --tune"
-            )
     if args.tune:
+        args.require_unset("with --tune", *OF_FIT)
         tune_settings(args)
-    elif args.road is not None:
-        fit_road(args, args.road)
-    else:
+        return
+    args.require_unset("without --tune", *OF_TUNE)
+    if args.road is None:
         raise ValueError("road must be given, unless with --tune")
+    fit_road(args, args.road)
 
 
 def tune_settings(args: Args) -> None:

@@ -238,7 +238,7 @@ def test_estimators_and_keywords_reach_the_environment():
         (["--policies", "nobody.safetensors"], "nobody.safetensors"),
         (["--policies", "nobody"], "'nobody'"),
         (["--env", f'{SHORT} {{"horizon": 60}}'], "horizon or the road's duration must be above"),
-        (["--beside", "card.json"], "--beside does not apply without --suite"),
+        (["--beside", "card.json"], "--beside must be left out without --suite"),
     ],
 )
 def test_bad_arguments_are_named_and_nothing_is_written(words, message, tmp_path):

@@ -49,8 +49,8 @@ def test_the_first_policy_that_suits_a_cell_acts_in_it(tmp_path):
         (("--policies", "static", "--beside", "nobody.json"), "nobody.json"),
         (("none", "--policies", "static"), "suite must be one of"),
         ((), "policies must be given with --suite"),
-        (("--test-seeds", "2000"), "--test-seeds does not apply with --suite"),
-        (("--estimators", "ekf"), "--estimators does not apply with --suite"),
+        (("--test-seeds", "2000"), "--test-seeds must be left out with --suite"),
+        (("--estimators", "ekf"), "--estimators must be left out with --suite"),
     ],
 )
 def test_bad_input_is_named_before_anything_is_played(words, message, tmp_path):
