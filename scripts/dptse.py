@@ -56,7 +56,10 @@ RENAMED: dict[str, dict[str, str]] = {
         "--seeds": "--train-seeds",
         "--schedule": "--policies",
     },
-    "import": {},
+    "import": {
+        "--keywords": "part of --env, 'ID {JSON}'",
+        "--name": "the name of the folder of --output",
+    },
     "info": {"--mu": "dptse_env.privacy.over_trips, a function,"},
     "record": {"--seeds": "--train-seeds, --validation-seeds or --test-seeds"},
     "study": {
@@ -80,7 +83,7 @@ RENAMED: dict[str, dict[str, str]] = {
 """What has the place of options that there were, by command."""
 
 MODULES = {name: f"scripts.{name.replace('-', '_')}" for group in GROUPS.values() for name in group}
-MODULES["import"] = "scripts.import_road"
+MODULES["import"] = "scripts.imports"
 
 
 def main(words: Sequence[str]) -> None:

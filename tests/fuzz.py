@@ -331,7 +331,7 @@ def fields(rng, folder):
     path = one_of([density, speed], rng)
     path.write_bytes(changed(path.read_bytes(), rng))
     source = FieldSource(density, cell=0.05, interval=5.0, speed=speed)
-    road = FieldRoad("measured", segments=2, lanes=3, speed_limit=100.0)
+    road = FieldRoad(segments=2, lanes=3, speed_limit=100.0)
     return (
         path.read_bytes(),
         lambda: import_field(source, road, folder / "new", SPLITS, 40),

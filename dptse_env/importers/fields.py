@@ -17,6 +17,7 @@ from dptse_env.importers.folder import (
     Split,
     assign_seeds,
     moved,
+    named_after,
     new_folder,
 )
 from dptse_env.importers.measured import with_measured
@@ -450,19 +451,17 @@ class FieldRoad:
     """The road of a field, which has no ramps.
 
     Attributes:
-        name: Lower-case letters, digits and hyphens.
         segments: Segments N that are estimated, each of equally many cells; one more at either end
             of the road is the boundary.
         lanes: Lanes.
         speed_limit: Speed limit [km/h].
     """
 
-    name: str
     segments: int
     lanes: int
     speed_limit: float
 
-    def corridor(self, segment_length: float, duration: int) -> Corridor:
+    def corridor(self, name: str, segment_length: float, duration: int) -> Corridor:
         """Return the road without demand and recordings."""
         geometry = Geometry(
             self.segments,
@@ -471,7 +470,7 @@ class FieldRoad:
             speed_limit=self.speed_limit,
         )
         conditions = Conditions(Demand(mainline=((0.0, 0.0),)), duration)
-        return Corridor(self.name, geometry, conditions, Scales.of(geometry))
+        return Corridor(name, geometry, conditions, Scales.of(geometry))
 
 
 def import_field(
@@ -488,7 +487,7 @@ def import_field(
     Args:
         source: The files.
         road: The road.
-        output: Folder to create; it appears when it is complete.
+        output: Folder to create; it appears when it is complete. Its name is that of the road.
         splits: Parts of the windows, in order of time.
         duration: Length of a window [s].
 
@@ -499,6 +498,7 @@ def import_field(
     """
     integer("duration", duration, 1)
     integer("segments", road.segments, 2)
+    name = named_after(output)
     require_output(output.parent, [output.name])
     density, flow = source.read(road.lanes, road.speed_limit)
     each = source.cells_of(road.segments, len(density))
@@ -509,7 +509,7 @@ def import_field(
     require(len(starts) > 0, "duration", allowed, duration)
     seeds = assign_seeds(splits, len(starts))
     flat = [seed for split in splits for seed in seeds[split.name]]
-    bare = road.corridor(each * source.cell, duration)
+    bare = road.corridor(name, each * source.cell, duration)
     # The boundary segments, at both ends, come last in a record.
     order = [*range(1, road.segments + 1), 0, road.segments + 1]
     windows = [field[start : start + duration + 1, order] for start in starts]

@@ -24,7 +24,7 @@ from dptse_env.importers.tables import FORMATS
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.imported import load_record, ranges, save_records
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.roads import write_corridor
+from dptse_env.traffic.roads import road_name, write_corridor
 from dptse_env.utils.files import hidden, left_hidden, require_output
 from dptse_env.utils.validation import require, require_name
 
@@ -150,6 +150,18 @@ def import_trajectories(
         drawn = load_record(recorded, flat[0])
         report = write_report(folder, road, recordings, seeds, sources, drawn, notes)
     return Imported(moved(road, output), seeds, report)
+
+
+def named_after(output: Path) -> str:
+    """Return the name of a road that is that of its folder.
+
+    Raises:
+        ValueError: It has no letter and no digit.
+    """
+    name = road_name(output.absolute().name)
+    allowed = "a folder whose name, which the road gets, has letters a to z or digits"
+    require(name != "", "output", allowed, str(output))
+    return name
 
 
 def moved(road: Corridor, output: Path) -> Corridor:

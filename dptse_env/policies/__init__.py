@@ -76,7 +76,7 @@ def read_policy(source: str | os.PathLike[str]) -> PolicyFile:
         )
     if path.suffix == ".zip":
         raise ValueError(
-            f"{name} is no saved policy; dptse policy import makes one of a model of "
+            f"{name} is no saved policy; dptse import policy makes one of a model of "
             "stable-baselines3"
         )
     card, weights = read_tensors(path)

@@ -28,6 +28,7 @@ from dptse_env.traffic.roads import (
     randomised,
     read_corridor,
     read_road,
+    road_name,
     write_corridor,
 )
 from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
@@ -70,6 +71,7 @@ __all__ = [
     "ranges",
     "read_corridor",
     "read_road",
+    "road_name",
     "simulate",
     "simulate_in_worker",
     "write_corridor",

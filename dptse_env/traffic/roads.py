@@ -216,6 +216,11 @@ def from_home(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> str
     return Path(os.path.relpath(target, home)).as_posix() if same_drive else target.as_posix()
 
 
+def road_name(text: str) -> str:
+    """Return a text as the name of a road."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+
+
 def _corridor(content: Mapping[str, Any], path: Path) -> Corridor:
     """Return the corridor of a file's fields."""
     fields = dict(content)
@@ -225,7 +230,7 @@ def _corridor(content: Mapping[str, Any], path: Path) -> Corridor:
             folder = str((path.resolve().parent / given["folder"]).resolve())
             fields[name] = {**given, "folder": folder}
     if "name" not in fields:
-        fields["name"] = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")
+        fields["name"] = road_name(path.stem)
     return Corridor.from_fields(fields)
 
 

@@ -333,7 +333,7 @@ def import_field(folder, windows):
     np.savetxt(folder / "speed.txt", 100.0 - density)
     done = run_command(
         "import", "field", "--density", folder / "density.txt", "--speed", folder / "speed.txt",
-        "--cell", "0.1", "--interval", "5", "--name", "ring", "--segments", "4", "--lanes", "2",
+        "--cell", "0.1", "--interval", "5", "--segments", "4", "--lanes", "2",
         "--speed-limit", "90", "--duration", "90", "--output", folder / "ring",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -55,7 +55,7 @@ def test_what_is_no_policy_is_refused(tmp_path):
         read_saved_policy("nobody")
     text = tmp_path / "text.zip"
     text.write_text("no weights")
-    with pytest.raises(ValueError, match=r"text\.zip is no saved policy; dptse policy import"):
+    with pytest.raises(ValueError, match=r"text\.zip is no saved policy; dptse import policy"):
         read_saved_policy(text)
     with pytest.raises(ValueError, match=r"schedule must be one of .*, got 'nobody'"):
         find_policy("nobody").load(gym.make(SHORT))

@@ -41,7 +41,7 @@ GUIDES = {
         ),
         "--seeds 2000:2016": "--seeds 2000:2002 --workers 1",
     },
-    "your-network.md": {"dptse fit town.toml": f"dptse fit town.toml {FIT} {SEEDS}"},
+    "your-network.md": {"dptse fit town/road.toml": f"dptse fit town/road.toml {FIT} {SEEDS}"},
     "many-machines.md": {
         "--executor ray --address auto": "--executor local --workers 1",
         "--seeds 2000:2032": "--seeds 2000:2002",
@@ -118,7 +118,7 @@ def test_a_policy_is_trained_compared_and_entered_in_the_suite(run_guide):
     observation = names["envs"].reset(seed=0)[0]
     loaded, imported = (
         names["load_policy"](file, names["unseen"]).predict(observation, deterministic=True)[0]
-        for file in ("mlp.safetensors", "imported.safetensors")
+        for file in ("mlp.safetensors", "imported/policy.safetensors")
     )
     assert (loaded == imported).all()
     assert read_policy("continued/best.safetensors").card["policy"]["class"] == "RoadPolicy"
@@ -141,9 +141,9 @@ def test_a_network_becomes_a_fitted_road(run_guide):
     need("sumo")
     printed, _ = run_guide("your-network.md")
     assert "on-ramp at face 4: on" in printed
-    road = read_corridor("town.toml")
+    road = read_corridor("town/road.toml")
     assert (road.geometry.n_mainline, road.geometry.off_ramps) == (15, (11,))
-    assert Path("town-fit/page.html").is_file()
+    assert Path("town/road-fit/page.html").is_file()
 
 
 @pytest.mark.slow

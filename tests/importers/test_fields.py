@@ -18,7 +18,7 @@ SPLITS = [
     Split("validation", 0.25, VALIDATION_SEEDS),
     Split("test", 0.25, TEST_SEEDS),
 ]
-ROAD = FieldRoad("measured", segments=3, lanes=4, speed_limit=110.0)
+ROAD = FieldRoad(segments=3, lanes=4, speed_limit=110.0)
 
 
 def write(folder, cells=10, intervals=90, **changes):

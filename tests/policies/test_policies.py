@@ -64,5 +64,5 @@ def test_files_that_are_not_there_or_of_models(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"'absent': .*come with the package \(.*private-"):
         read_policy("absent")
     (tmp_path / "model.zip").write_bytes(b"PK\x03\x04")
-    with pytest.raises(ValueError, match=r"model\.zip is no saved policy; dptse policy import"):
+    with pytest.raises(ValueError, match=r"model\.zip is no saved policy; dptse import policy"):
         read_policy(tmp_path / "model.zip")

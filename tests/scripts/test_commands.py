@@ -27,7 +27,7 @@ from tests.helpers import ROOT, SHORT, fast_and_slow, save_untrained
 from tests.importers.data import plain, stream
 from tests.importers.sumo_net.conftest import motorway
 from tests.scripts.commands import refused, run_command
-from tests.scripts.test_policy import save_model
+from tests.scripts.test_import_policy import save_model
 
 KINDS = ["trajectories", "network", "field", "policy"]
 COMMANDS = [*MODULES, *(f"import {kind}" for kind in KINDS)]
@@ -74,7 +74,7 @@ def test_the_example_of_the_help_runs_as_it_is_printed(name, tmp_path, monkeypat
     if name == "fit":
         road = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
         (tmp_path / "my-road.toml").write_text(road)
-    if name == "policy":
+    if name == "import policy":
         save_model(tmp_path, bandwidth=1)
     if "--report" in line:
         shutil.copytree(ROOT / "results" / "paper", tmp_path / "results" / "paper")
@@ -280,7 +280,7 @@ def with_keyword(keyword):
 
 SETTINGS = b'{"x": {"estimator": "ekf", "settings": {"count_noise": 1}, "provenance": {}}}'
 FIELD = ["--cell", "0.1", "--interval", "5", "--segments", "6"]
-FIELD_ROAD = ["--name", "x", "--lanes", "2", "--speed-limit", "100"]
+FIELD_ROAD = ["--lanes", "2", "--speed-limit", "100"]
 NETWORK = b"<configuration><input><net-file value='n.net.xml'/></input></configuration>"
 POINTS = ["import", "trajectories", "--env", SHORT]
 FILES = {
@@ -322,7 +322,7 @@ FAST = [
     ("trajectories", "truncated"), ("field", "folder"),
 ]  # fmt: skip
 ALL = [(kind, how) for kind in FILES for how in ("missing", "folder", "noise", "truncated")]
-OUTPUTS = {"record": ["--records", "cache"], "network": ["--output", "o.toml"]}
+OUTPUTS = {"record": ["--records", "cache"]}
 
 
 @pytest.mark.parametrize(("kind", "how"), fast_and_slow(ALL, FAST))

@@ -8,17 +8,18 @@ import pytest
 pytest.importorskip("sb3_contrib")
 pytest.importorskip("tyro")
 
+from agents import models
 from dptse_env.importers import folder
 from dptse_env.importers.fields import FieldSource
 from dptse_env.traffic import library
 from dptse_env.utils import files
-from scripts import import_road, policy
+from scripts import imports
 from scripts.dptse import MODULES
 from tests.helpers import SHORT, fast_and_slow
 from tests.importers.data import plain, stream
 from tests.importers.sumo_net.conftest import motorway
 from tests.scripts.commands import refused, run_command
-from tests.scripts.test_import_road import on
+from tests.scripts.test_imports import on
 from tests.scripts.test_train_estimator import SMALL
 
 ROAD = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
@@ -42,15 +43,15 @@ COMMANDS = {
     ),
     "import field": (
         ["--density", "table.txt", "--speed", "table.txt", "--cell", "0.1", "--interval", "5",
-         "--name", "a", "--segments", "6", "--lanes", "3", "--speed-limit", "100"], "",
+         "--segments", "6", "--lanes", "3", "--speed-limit", "100"], "",
     ),
-    "import network": (["--net", "road.net.xml", "--path", "a b"], ".toml"),
-    "policy": (["import", "model.zip", "--env", SHORT, "--trust"], ".safetensors"),
+    "import network": (["--net", "road.net.xml", "--path", "a b"], "road.toml"),
+    "import policy": (["model.zip", "--env", SHORT, "--trust"], "policy.safetensors"),
 }  # fmt: skip
 """Arguments of each command, and what it must not replace: a file in its output, or the output
 itself, of some ending."""
 
-FAST = ("evaluate", "train", "fit", "audit", "record", "policy")
+FAST = ("evaluate", "train", "fit", "audit", "record", "import policy")
 
 
 class BegunError(Exception):
@@ -74,7 +75,7 @@ def test_a_place_where_results_cannot_go_is_refused_before_any_work(name, tmp_pa
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("DPTSE_CACHE", str(tmp_path / "cache"))
     for where, work in (
-        (library, "record_seeds"), (policy, "_unpickled"), (import_road, "segment_path"),
+        (library, "record_seeds"), (models, "_unpickled"), (imports, "segment_path"),
         (folder, "Recording"), (FieldSource, "read"),
     ):  # fmt: skip
         monkeypatch.setattr(where, work, begin)
@@ -85,27 +86,24 @@ def test_a_place_where_results_cannot_go_is_refused_before_any_work(name, tmp_pa
     motorway(tmp_path)
     (tmp_path / "file").write_text("mine")
     words, kept = COMMANDS[name]
-    is_one = kept is not None and (not kept or kept.startswith("."))
-    ending = kept if is_one else ""
 
     def given(place):
         option = "--records" if name == "record" else "--output"
         return [*name.split(), *words, option, place]
 
     here = sorted(tmp_path.iterdir())
-    assert "file" in refused(*given(f"file/below{ending}"))
-    if not is_one:
-        assert "file" in refused(*given("file"))
+    assert "file" in refused(*given("file/below"))
+    assert "file" in refused(*given("file"))
     for start in ("", "new/"):
-        long = f"{start}{(230 if is_one else 300) * 'a'}{ending}"  # the hidden one is longer
+        long = f"{start}{(230 if kept == '' else 300) * 'a'}"  # the hidden one is longer
         assert re.search(rf" got {long}\S*: File name too long$", refused(*given(long)))
     with monkeypatch.context() as patch:
         patch.setattr(files.tempfile, "TemporaryFile", refuse)  # a mode binds no root
-        assert "must be a folder that can be written" in refused(*given(f"new{ending}"))
+        assert "must be a folder that can be written" in refused(*given("new"))
     assert sorted(tmp_path.iterdir()) == here
     if kept is not None:
-        taken = tmp_path / ("taken" if not is_one else f"taken{kept}")
-        mine = taken if is_one else taken / kept
+        taken = tmp_path / "taken"
+        mine = taken / kept
         mine.mkdir(parents=True)
         offered = run_command(*name.split(), "-h").stdout
         takes_force = "--force" in offered and name not in ("fit", "evaluate --suite short")
@@ -116,4 +114,4 @@ def test_a_place_where_results_cannot_go_is_refused_before_any_work(name, tmp_pa
         assert str(mine) in refused(*given(taken))
         assert mine.read_text() == "mine"
     with pytest.raises(BegunError):  # what was refused is the place alone
-        run_command(*given(f"new/below{ending}"))
+        run_command(*given("new/below"))

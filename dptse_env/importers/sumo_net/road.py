@@ -44,6 +44,39 @@ class ImportedRoad:
     record: Record
     remarks: tuple[str, ...]
 
+    @property
+    def description(self) -> list[str]:
+        """The road, what enters and leaves it, and the remarks, in lines."""
+        corridor, names = self.corridor, self.segments.names
+        geometry, files = corridor.geometry, corridor.sumo
+        assert files is not None
+        n, n_on = geometry.n_mainline, len(geometry.on_ramps)
+        lengths, lanes, limits = (
+            each[:n]
+            for each in (geometry.segment_lengths, geometry.segment_lanes, geometry.speed_limits)
+        )
+        demand = corridor.conditions.published_demand
+        on_ramps = zip(geometry.on_ramps, names[:n_on], demand.ramp_profiles, strict=True)
+        off_ramps = zip(geometry.off_ramps, names[n_on:], geometry.exit_shares, strict=True)
+        return [
+            f"{corridor.name}: from {Path(files.net).name}, seconds {files.begin} to "
+            f"{files.begin + corridor.conditions.duration}",
+            f"{n} segments of {1000 * min(lengths):.0f} to {1000 * max(lengths):.0f} m, "
+            f"{min(lanes)} to {max(lanes)} lanes, {min(limits):.0f} to {max(limits):.0f} km/h",
+            f"mainline: {_range(demand.mainline)}",
+            *(f"on-ramp at face {face}: {name}, {_range(rates)}" for face, name, rates in on_ramps),
+            *(
+                f"off-ramp at face {face}: {name}, {100 * share:.1f} % leave"
+                for face, name, share in off_ramps
+            ),
+            *(f"note: {remark}" for remark in self.remarks),
+        ]
+
+
+def _range(profile: Profile) -> str:
+    rates = [rate for _, rate in profile]
+    return f"{min(rates):.0f} to {max(rates):.0f} veh/h"
+
 
 def import_road(
     files: Files,

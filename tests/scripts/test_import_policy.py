@@ -1,7 +1,8 @@
-"""``dptse policy import``: models of stable-baselines3 become saved policies."""
+"""``dptse import policy``: models of stable-baselines3 become saved policies."""
 
 import json
 import pickle
+import shlex
 
 import gymnasium as gym
 import numpy as np
@@ -38,11 +39,10 @@ def save_model(folder, action="scores", kind=PPO, policy="MlpPolicy", **keywords
     return model, scaled, env
 
 
-def words(folder, *more):
-    return [
-        "policy", "import", folder / "model.zip", "--env", SHORT,
-        "--output", folder / "mine.safetensors", *more,
-    ]  # fmt: skip
+def words(folder, keywords=None, *more):
+    env = f"{SHORT} {json.dumps(keywords or {})}"
+    given = folder / "model.zip", "--env", env, "--output", folder / "mine"
+    return ["import", "policy", *given, *more]
 
 
 @pytest.mark.parametrize(
@@ -56,10 +56,13 @@ def words(folder, *more):
 def test_an_imported_model_acts_as_it_did(tmp_path, action, kind, policy, keywords):
     model, scaled, env = save_model(tmp_path, action, kind, policy, **keywords)
     statistics = ["--vecnormalize", tmp_path / "vecnormalize.pkl", "--acts", "drawn"]
-    done = run_command(*words(tmp_path, "--keywords", json.dumps(keywords), "--trust", *statistics))
+    done = run_command(*words(tmp_path, keywords, "--trust", *statistics))
     assert done.returncode == 0, done.stderr
     assert f"action encoding '{action}'" in done.stdout
-    imported = load_policy(tmp_path / "mine.safetensors", env)
+    path = tmp_path / "mine" / "policy.safetensors"
+    given = shlex.quote(f"{SHORT} {json.dumps(keywords)}")
+    assert f"next: dptse evaluate --env {given} --policies {path}\n" in done.stdout
+    imported = load_policy(path, env)
     assert imported.card["training"] == {"learner": "imported", "seed": 4, "steps": 0}
     assert not imported.deterministic
     seen, _ = env.reset(seed=1)
@@ -70,33 +73,40 @@ def test_an_imported_model_acts_as_it_did(tmp_path, action, kind, policy, keywor
 def test_nothing_is_unpickled_without_the_users_word(tmp_path):
     (tmp_path / "model.zip").write_bytes(pickle.dumps(Bomb()))
     assert "trust must be given, since" in refused(*words(tmp_path))
-    given = words(tmp_path, "--trust")  # everything else is looked at first
-    assert "bandwidth must be" in refused(*given, "--keywords", '{"bandwidth": 9}')
+    # Everything else is looked at first.
+    assert "bandwidth must be" in refused(*words(tmp_path, {"bandwidth": 9}, "--trust"))
+    given = words(tmp_path, {}, "--trust")
     assert "env must be the id" in refused(*given, "--env", "nope")
-    assert "bandwidth must be" in refused(*given, "--env", f'{SHORT} {{"bandwidth": 9}}')
-    assert "must be a .safetensors file" in refused(*given, "--output", tmp_path / "mine.zip")
-    assert not (tmp_path / "mine.safetensors").exists()
+    assert "env must be an id and a JSON object" in refused(*given, "--env", f"{SHORT} [1]")
+    assert "output must be a folder" in refused(*given, "--output", tmp_path / "model.zip")
+    assert not (tmp_path / "mine").exists()
 
 
 def test_what_cannot_be_imported_is_named(tmp_path):
-    assert "there is no file" in refused(*words(tmp_path, "--trust"))
+    assert "there is no file" in refused(*words(tmp_path, {}, "--trust"))
     save_model(tmp_path)
     (tmp_path / "bomb.pkl").write_bytes(pickle.dumps(Bomb()))
     (tmp_path / "three.pkl").write_bytes(pickle.dumps(3))
-    for more, message in (
-        (["--keywords", '{"bandwidth": 9}'], "bandwidth must be"),
-        (
-            ["--keywords", '{"corridor": "paper-highway"}'],
-            "model.observation_space must be of shape",
-        ),
-        (["--keywords", '{"action": "mask"}'], "model.action_space must be MultiBinary"),
-        (["--keywords", "[1]"], "keywords must be a JSON object"),
-        (["--vecnormalize", tmp_path / "bomb.pkl"], "code of the file runs"),
-        (["--vecnormalize", tmp_path / "three.pkl"], "must be a VecNormalize, got int"),
+    for keywords, more, message in (
+        ({"corridor": "paper-highway"}, [], "model.observation_space must be of shape"),
+        ({"action": "mask"}, [], "model.action_space must be MultiBinary"),
+        ({}, ["--vecnormalize", tmp_path / "bomb.pkl"], "code of the file runs"),
+        ({}, ["--vecnormalize", tmp_path / "three.pkl"], "must be a VecNormalize, got int"),
     ):
-        assert message in refused(*words(tmp_path, "--trust", *more))
+        assert message in refused(*words(tmp_path, keywords, "--trust", *more))
     (tmp_path / "model.zip").write_text("no archive")
-    assert "model.zip cannot be read" in refused(*words(tmp_path, "--trust"))
-    (tmp_path / "mine.safetensors").write_text("mine")
-    assert "mine.safetensors" in refused(*words(tmp_path, "--trust"))
-    assert (tmp_path / "mine.safetensors").read_text() == "mine"
+    assert "model.zip cannot be read" in refused(*words(tmp_path, {}, "--trust"))
+    assert not (tmp_path / "mine").exists()
+
+
+def test_a_policy_is_replaced_by_force_alone(tmp_path):
+    *_, env = save_model(tmp_path)
+    path = tmp_path / "mine" / "policy.safetensors"
+    path.parent.mkdir()
+    path.write_text("mine")
+    assert str(path) in refused(*words(tmp_path, {}, "--trust"))
+    assert path.read_text() == "mine"
+    done = run_command(*words(tmp_path, {}, "--trust", "--force", "--quiet", "--json"))
+    found = json.loads(done.stdout)
+    assert (found["policy"], found["action"]) == (str(path), "scores")
+    assert load_policy(path, env).card["training"]["learner"] == "imported"

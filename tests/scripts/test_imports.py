@@ -1,4 +1,4 @@
-"""Import of trajectories, of a field and of a network, by the command."""
+"""Import of trajectories, of a field and of a network by the command."""
 
 import json
 import re
@@ -161,7 +161,7 @@ def test_the_page_on_own_data_has_commands_that_run(fifteen_minutes, monkeypatch
     assert file["ids_shared"] > 10
     assert file["vanished"] < 0.02 * file["pieces"]
     assert re.search(
-        r"^next: dptse evaluate .*us-101/road.toml.* --seeds 2000:2001$", printed, re.M
+        r"^next: dptse evaluate .*us-101/road.toml.* --test-seeds 2000:2001$", printed, re.M
     )
 
 
@@ -172,7 +172,8 @@ def test_the_page_on_own_data_imports_a_field(tmp_path, monkeypatch):
     np.savetxt("speed.txt", 110.0 - waves)
     printed = run(*commands_of("your-data.md")[-1][1:])
     assert "training: 1 window(s), traffic seeds 0\n" in printed
-    assert read_corridor("ring-road/road.toml").geometry.n_mainline == 6
+    road = read_corridor("ring-road/road.toml")
+    assert (road.name, road.geometry.n_mainline) == ("ring-road", 6)
 
 
 @pytest.mark.slow
@@ -202,7 +203,7 @@ def test_a_field_says_what_comes_next_or_what_is_missing_for_it(more, missing, n
     field = write(tmp_path, intervals=60)
     printed = run(
         "field", "--density", field.density, "--speed", field.speed, "--cell", "0.05",
-        "--interval", "5", "--density-unit", "veh/ft", "--speed-unit", "ft/s", "--name", "mine",
+        "--interval", "5", "--density-unit", "veh/ft", "--speed-unit", "ft/s",
         "--segments", "3", "--lanes", "5", "--speed-limit", "110", *more,
         "--output", tmp_path / "new",
     )  # fmt: skip
@@ -229,16 +230,23 @@ def town(tmp_path_factory):
 
 
 def test_a_network_becomes_a_road_of_any_environment(town):
-    named, given = town / "My own.toml", town / "given.toml"
+    named, given = town / "My own" / "road.toml", town / "given" / "road.toml"
     words = "network", "--duration", "120", "--output"
-    printed = run(*words, named, "--configuration", town / "own.sumocfg", "--path", "in ... out")
+    own = "--configuration", town / "own.sumocfg", "--path", "in ... out"
+    printed = run(*words, named.parent, *own)
     assert "on-ramp at face 3: ramp-b" in printed
     assert "off-ramp at face 15: exit-a" in printed
     assert f"next: dptse fit {shlex.quote(named.as_posix())}\n" in printed
     files = "--net", town / "road.net.xml", "--routes", town / "road.rou.xml"
-    run(*words, given, *files, "--path", " ".join(PATH), "--step-length", "0.5")
+    more = "--path", " ".join(PATH), "--step-length", "0.5", "--quiet"
+    assert run(*words, given.parent, *files, *more) == ""
     assert read_corridor(given).digest == read_corridor(named).digest
     assert (read_corridor(given).name, read_corridor(named).name) == ("given", "my-own")
+    assert f"got {named}" in refused("import", *words, named.parent, *own)
+    found = json.loads(run(*words, named.parent, *own, "--force", "--json"))
+    assert found["road"] == str(named)
+    assert [line.split()[1] for line in found["next"]] == ["fit", "evaluate"]
+    assert any("fixed_sensors = " in note for note in found["notes"])
     with pytest.warns(UserWarning, match="values measured or tuned on"):
         env = make_env(
             corridor=str(named), estimator="random_walk", traffic_seeds="0:1",
@@ -265,7 +273,7 @@ def test_what_is_imported_can_be_played_as_the_last_line_says(tmp_path):
     routes = tmp_path / "road.rou.xml"
     routes.write_text('<routes><flow id="f" from="m1" to="m2" end="60" period="4"/></routes>')
     words = "network", "--net", tmp_path / "road.net.xml", "--routes", routes, "--path", "m1 m2"
-    more = "--segment-length", "300", "--duration", "60", "--output", tmp_path / "road.toml"
+    more = "--segment-length", "300", "--duration", "60", "--output", tmp_path / "road"
     netconvert(tmp_path, NODES, EDGES.format(76), "<connections/>")
     assert " of the 87.4 m for a segment and a boundary" in refused("import", *words, *more)
     netconvert(tmp_path, NODES, EDGES.format(81), "<connections/>")
@@ -283,9 +291,12 @@ def test_what_is_imported_can_be_played_as_the_last_line_says(tmp_path):
         (("--net", "{town}/road.net.xml"), "error: path must be"),
         (("--net", "{town}/road.net.xml", "--path", "in ... on out"), "error: path must be"),
         (("--net", "{town}/road.net.xml", "--path", "on"), "error: path: {town}/road.net.xml"),
-        (("--output", "road.json"), "error: output must be a .toml file"),
+        (
+            ("--net", "{town}/road.net.xml", "--path", "in", "--output", "{town}/…"),
+            "error: output must be a folder whose name",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_network_is_said(words, message, town):
-    given = [each.format(town=town) for each in words]
+    given = [each.format(town=town) for each in ("--output", "{town}/new", *words)]
     assert refused("import", "network", *given).startswith(message.format(town=town))
