@@ -216,7 +216,7 @@ def record(
         ValueError: A seed is out of range or was not recorded.
         RecordingError: A recording fails, or the folder cannot be written.
         NetconvertError: The corridor has to be compiled and cannot be.
-        SumoVersionError: libsumo is missing, broken or of another release series.
+        SumoVersionError: libsumo is missing, broken or too old.
     """
     library: RecordLibrary = open_library(records)
     missing = library.missing(corridor, seeds)

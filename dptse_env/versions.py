@@ -1,9 +1,10 @@
-"""The version of this code, with a digest of what moves its numbers: rows and cards name it."""
+"""Versions of this code and of SUMO, with a digest of what moves numbers, for rows and cards."""
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import re
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from functools import cache
@@ -13,6 +14,10 @@ from typing import Any
 from dptse_env.tools import TOOLS
 
 __version__ = "0.3.0.dev0"
+
+TESTED_SUMO = "1.28"
+"""Release of SUMO that this version is tested with, the oldest that is taken. A newer one
+simulates the same scenario differently."""
 
 PACKAGE = Path(__file__).parent
 
@@ -30,6 +35,51 @@ PLAYERS = ("environments.py", "play.py", "policies.py", "watchers.py")
 
 EQUAL = PACKAGE / "equal_digests.txt"
 """Declares digests equal: those on one line have the same numbers, and the first one's name."""
+
+
+class SumoVersionError(RuntimeError):
+    """The installed libsumo cannot make records; the message says why, and what to do."""
+
+
+def sumo_version() -> str:
+    """Return the version of the installed libsumo, without importing it.
+
+    Raises:
+        SumoVersionError: libsumo is missing or older than `TESTED_SUMO`.
+    """
+    version = installed("libsumo")
+    if version is None:
+        raise SumoVersionError(f"libsumo is not installed: pip install 'libsumo~={TESTED_SUMO}.0'")
+    require_sumo(version)
+    return version
+
+
+def require_sumo(version: str) -> None:
+    """Check a version of libsumo.
+
+    Raises:
+        SumoVersionError: It is older than `TESTED_SUMO`, or no version.
+    """
+    if release(version) < release(TESTED_SUMO):
+        raise SumoVersionError(
+            f"libsumo must be {TESTED_SUMO} or newer, found {version}: "
+            f"pip install --force-reinstall 'libsumo~={TESTED_SUMO}.0'"
+        )
+
+
+def release(version: str) -> tuple[int, ...]:
+    """Return the first two numbers of a version; none where it has none."""
+    return tuple(int(number) for number in re.findall(r"\d+", version)[:2])
+
+
+def installed(package: str) -> str | None:
+    """Return the version of a package; None if it is not installed."""
+    from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 (slow to import)
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def code_version() -> str:
@@ -82,8 +132,12 @@ def equal_digests() -> Mapping[str, str]:
 
 @cache
 def digest() -> str:
-    """Return 12 digits of the digest of this code, the same in a wheel and in a checkout."""
-    return digest_of(PACKAGE, TOOLS)
+    """Return 12 digits of the digest of this code and of the release of SUMO that it records with.
+
+    It is the same in a wheel and in a checkout.
+    """
+    about = digest_of(PACKAGE, TOOLS), release(installed("libsumo") or "")
+    return hashlib.sha256(repr(about).encode()).hexdigest()[:12]
 
 
 def digest_of(package: Path, tools: Path) -> str:

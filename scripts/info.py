@@ -5,7 +5,6 @@ dptse info
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import platform
 import sys
@@ -19,14 +18,14 @@ from dptse_env.traffic import RecordLibrary
 from dptse_env.traffic.library import CACHE_VARIABLE
 from dptse_env.utils.kernels import default_folder
 from dptse_env.utils.threads import n_cores
-from dptse_env.versions import code_version
+from dptse_env.versions import code_version, installed
 from scripts.cli import Command
 
 PACKAGES = (
     "gymnasium", "libsumo", "sumolib", "eclipse-sumo", "numpy", "scipy", "numba", "mpmath",
     "filterpy", "qpsolvers", "piqp", "safetensors", "matplotlib", "platformdirs", "tomli-w",
     "tqdm", "torch", "stable-baselines3", "sb3-contrib", "optuna", "plotly", "polars", "loky",
-    "rich", "tyro", "ray", "filelock", "moviepy", "pygame", "tomlkit",
+    "rich", "tyro", "ray", "filelock", "moviepy", "pygame-ce", "tomlkit",
 )  # fmt: skip
 
 VARIABLES = (CACHE_VARIABLE, "NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT", "OMP_NUM_THREADS", "SUMO_HOME")
@@ -58,14 +57,6 @@ def _content(folder: Path, pattern: str) -> dict[str, Any]:
     """Return folder, number and size of the files that a pattern fits."""
     sizes = [path.stat().st_size for path in folder.glob(pattern)]
     return {"folder": str(folder), "files": len(sizes), "megabytes": round(sum(sizes) / 1e6, 1)}
-
-
-def installed(package: str) -> str | None:
-    """Return the version of a package; None if it is missing."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def main(args: Args) -> None:

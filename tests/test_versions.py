@@ -98,6 +98,15 @@ def test_the_digest_stays_where_numbers_do(folder):
     assert digest(folder) == first
 
 
+def test_the_digest_moves_with_the_release_of_sumo(monkeypatch):
+    digests = []
+    for version in ("1.28.0", "1.28.3", "1.29.0", "2.28.0", None):
+        monkeypatch.setattr(versions, "installed", lambda package, found=version: found)
+        digests.append(versions.digest.__wrapped__())
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 4
+
+
 def test_the_package_has_no_other_kinds_of_files():
     files = Path(dptse_env.__file__).parent.rglob("*.*")
     kinds = {path.suffix for path in files if path.is_file()} - {".pyc"}

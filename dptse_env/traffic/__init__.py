@@ -32,8 +32,9 @@ from dptse_env.traffic.roads import (
     write_corridor,
 )
 from dptse_env.traffic.scenario import MAINLINE, Scenario, draw_scenario
-from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
+from dptse_env.traffic.sumo import RecordingError, simulate
 from dptse_env.traffic.sumo_input import NetconvertError
+from dptse_env.versions import SumoVersionError
 
 __all__ = [
     "CORRIDORS",

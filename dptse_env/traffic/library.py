@@ -18,6 +18,7 @@ import multiprocessing
 import os
 import threading
 import time
+import warnings
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -30,13 +31,14 @@ from dptse_env.traffic.imported import load_record, ranges, record_path, require
 from dptse_env.traffic.own_sumo import WARNING
 from dptse_env.traffic.record import RECORD_VERSION, InvalidRecordError, Record
 from dptse_env.traffic.recording import record_seeds
-from dptse_env.traffic.sumo import RecordingError, SumoVersionError, sumo_version
+from dptse_env.traffic.sumo import RecordingError
 from dptse_env.traffic.sumo_input import NetconvertError
 from dptse_env.utils.files import require_writable
 from dptse_env.utils.progress import make_bar
 from dptse_env.utils.threads import n_cores
 from dptse_env.utils.units import HOUR
 from dptse_env.utils.validation import integer, require
+from dptse_env.versions import TESTED_SUMO, SumoVersionError, release, sumo_version
 
 CACHE_VARIABLE = "DPTSE_CACHE"
 """Environment variable with the directory of the records; errors name it."""
@@ -101,7 +103,7 @@ class RecordLibrary:
             InvalidRecordError: A record of the corridor's recordings is damaged or exchanged.
             RecordingError: The record cannot be made; the message names the library and the seed.
             NetconvertError: The corridor has to be compiled and cannot be.
-            SumoVersionError: libsumo is missing, broken or of another release series.
+            SumoVersionError: libsumo is missing, broken or too old.
         """
         seed = integer("traffic seed", seed, 0)
         key = corridor.digest, seed
@@ -122,7 +124,7 @@ class RecordLibrary:
 
         Raises:
             ValueError: A seed is negative or no integer, or was not recorded.
-            SumoVersionError: libsumo is missing or of another release series.
+            SumoVersionError: libsumo is missing or too old.
         """
         wanted = dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds)
         if corridor.recordings is not None:
@@ -145,7 +147,7 @@ class RecordLibrary:
             RecordingError: A recording fails; the message names its seed and the number of records
                 in the library. Recordings in progress are finished and kept, no other is started.
             NetconvertError: The corridor has to be compiled and cannot be.
-            SumoVersionError: libsumo is missing, broken or of another release series.
+            SumoVersionError: libsumo is missing, broken or too old.
         """
         n_workers = n_cores() if workers is None else integer("workers", workers, 1)
         wanted = list(dict.fromkeys(integer("traffic seed", seed, 0) for seed in seeds))
@@ -158,7 +160,7 @@ class RecordLibrary:
         """Return the file of a record, whether it exists or not."""
         if corridor.recordings is not None:
             return record_path(corridor.recordings.folder, seed)
-        folder = f"records-v{RECORD_VERSION}-sumo-{sumo_version()}"
+        folder = f"records-v{RECORD_VERSION}-sumo-{_used_version()}"
         return self.path / folder / corridor.digest[:32] / f"{seed:08d}.safetensors"
 
     def prepare(self, corridor: Corridor, seed: int) -> Path:
@@ -276,6 +278,19 @@ def _say_recording(corridor: Corridor, n_seeds: int) -> None:
         corridor.name,
         seconds,
     )
+
+
+def _used_version() -> str:
+    """Return the version of libsumo, and warn if it is newer than the tested one."""
+    version = sumo_version()
+    if release(version) > release(TESTED_SUMO) and multiprocessing.parent_process() is None:
+        warnings.warn(
+            f"libsumo {version} is newer than {TESTED_SUMO}, which dptse-env is tested with: seeds "
+            "give other traffic than in its results; for theirs, pip install "
+            f"'libsumo~={TESTED_SUMO}.0'",
+            stacklevel=1,  # one place, so that Python tells it once
+        )
+    return version
 
 
 def _source(corridor: Corridor, seed: int) -> dict[str, object]:

@@ -28,9 +28,10 @@ from loky.process_executor import BrokenProcessPool
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.own_sumo import Remark
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.sumo import RecordingError, SumoVersionError, simulate
+from dptse_env.traffic.sumo import RecordingError, simulate
 from dptse_env.traffic.sumo_input import NetconvertError
 from dptse_env.utils.registry import MissingExtraError
+from dptse_env.versions import SumoVersionError
 
 ATTEMPTS = 3
 """Workers that may die on a traffic seed, for instance for lack of memory. An error that a worker
@@ -67,7 +68,7 @@ def record_seeds(
         RecordingError: A recording fails, or `ATTEMPTS` workers died on a seed. Recordings in
             progress are finished and kept, no other is started.
         NetconvertError: The corridor has to be compiled and cannot be.
-        SumoVersionError: libsumo is missing, broken or of another release series.
+        SumoVersionError: libsumo is missing, broken or too old.
         MissingExtraError: The corridor has to be compiled and netconvert is missing.
     """
     waiting, deaths = dict(paths), Counter[int]()

@@ -12,7 +12,6 @@ Two settings were chosen by measurement on the paper's corridor (W99, 12 seeds):
 """
 
 import contextlib
-import importlib.metadata
 import os
 import sys
 import tempfile
@@ -32,9 +31,7 @@ from dptse_env.traffic.record import Record
 from dptse_env.traffic.scenario import Scenario, draw_scenario
 from dptse_env.traffic.sumo_input import LONGEST_OUTPUT, edge_ids, net_xml, routes_xml
 from dptse_env.utils.units import KMH
-
-SUPPORTED_SUMO = "1.28"
-"""Release series that records are made with: others simulate the same scenario differently."""
+from dptse_env.versions import SumoVersionError, require_sumo, sumo_version
 
 STEP_LENGTH = 0.5
 """SUMO's time step [s]: at 1 s, W99 brakes in emergency four times as often (377 against 85 times
@@ -73,26 +70,6 @@ class RecordingError(RuntimeError):
         return cls(f"recording {corridor.name} with traffic seed {seed} failed: {cause}")
 
 
-class SumoVersionError(RuntimeError):
-    """The installed libsumo is not of the release series that records are made with."""
-
-
-def sumo_version() -> str:
-    """Return the version of the installed libsumo, without importing it.
-
-    Raises:
-        SumoVersionError: libsumo is missing or of another release series.
-    """
-    try:
-        version = importlib.metadata.version("libsumo")
-    except importlib.metadata.PackageNotFoundError as error:
-        raise SumoVersionError(
-            f"libsumo is not installed: pip install 'libsumo=={SUPPORTED_SUMO}.*'"
-        ) from error
-    _check_series(version)
-    return version
-
-
 def simulate(corridor: Corridor, seed: int, remark: Remark = lambda text: None) -> Record:
     """Simulate one scenario in this process and record it.
 
@@ -108,7 +85,7 @@ def simulate(corridor: Corridor, seed: int, remark: Remark = lambda text: None) 
         RecordingError: SUMO fails, the corridor's own files are missing or changed, or libsumo
             already holds a simulation in this process, which is left unchanged.
         NetconvertError: The corridor has to be compiled and cannot be.
-        SumoVersionError: libsumo is missing, broken or of another release series.
+        SumoVersionError: libsumo is missing, broken or too old.
     """
     scenario = draw_scenario(corridor, seed)
     with running(corridor, scenario, remark) as libsumo:
@@ -227,20 +204,12 @@ def _import_libsumo() -> ModuleType:
             f"libsumo {expected} is installed but cannot be imported ({error}): reinstall libsumo"
         ) from error
     version = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
-    _check_series(version)
+    require_sumo(version)
     if version != expected:
         raise SumoVersionError(
             f"libsumo reports version {version} but is installed as {expected}: reinstall libsumo"
         )
     return libsumo  # type: ignore[no-any-return]
-
-
-def _check_series(version: str) -> None:
-    if version.split(".")[:2] != SUPPORTED_SUMO.split("."):
-        raise SumoVersionError(
-            f"libsumo must be of the series {SUPPORTED_SUMO}, found {version}: "
-            f"pip install --force-reinstall 'libsumo=={SUPPORTED_SUMO}.*'"
-        )
 
 
 @contextlib.contextmanager

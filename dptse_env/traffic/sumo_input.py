@@ -26,6 +26,7 @@ from dptse_env.traffic.roads import SHIPPED_CORRIDORS
 from dptse_env.traffic.scenario import MAINLINE, Scenario
 from dptse_env.utils.registry import missing_extra
 from dptse_env.utils.units import KMH
+from dptse_env.versions import installed, sumo_version
 
 LANE_WIDTH_M = 3.2
 RAMP_ANGLE = math.radians(45.0)  # a flat ramp would stretch the junction over half a segment
@@ -46,7 +47,7 @@ Point = tuple[float, float]
 
 
 class NetconvertError(RuntimeError):
-    """netconvert refused to compile the net of a road."""
+    """netconvert cannot compile the net of a road; the message says why."""
 
 
 def edge_ids(geometry: Geometry) -> tuple[str, ...]:
@@ -100,7 +101,8 @@ def compile_net(geometry: Geometry) -> str:
 
     Raises:
         MissingExtraError: `eclipse-sumo` is not installed.
-        NetconvertError: netconvert fails.
+        NetconvertError: It is of another version than libsumo, or netconvert fails.
+        SumoVersionError: libsumo is missing or too old.
     """
     command = [str(_netconvert()), *NETCONVERT_OPTIONS]
     with tempfile.TemporaryDirectory(prefix="dptse-net-") as directory:
@@ -123,10 +125,19 @@ def compile_net(geometry: Geometry) -> str:
 
 
 def _netconvert() -> Path:
-    """Return the path of the netconvert of `eclipse-sumo`; SUMO_HOME is not used."""
+    """Return the path of the netconvert of `eclipse-sumo`; SUMO_HOME is not used.
+
+    A record is known by the version of libsumo alone, so netconvert has to be of the same.
+    """
     spec = importlib.util.find_spec("sumo")
     if spec is None or spec.origin is None:
         raise missing_extra("sumo", "a road of your own, which netconvert compiles,")
+    found, wanted = installed("eclipse-sumo"), sumo_version()
+    if found != wanted:
+        raise NetconvertError(
+            f"eclipse-sumo must be of the version of libsumo, {wanted}, found {found}: "
+            f"pip install 'eclipse-sumo=={wanted}'"
+        )
     suffix = ".exe" if os.name == "nt" else ""
     return Path(spec.origin).parent / "bin" / f"netconvert{suffix}"
 

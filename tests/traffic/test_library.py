@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 
+from dptse_env import versions
 from dptse_env.traffic import (
     PAPER_HIGHWAY,
     SHORT_HIGHWAY,
@@ -18,7 +19,6 @@ from dptse_env.traffic import (
     SumoVersionError,
     library,
     randomised,
-    sumo,
 )
 from tests.traffic.test_record import assert_same
 
@@ -125,6 +125,13 @@ def test_what_shapes_a_record_is_in_its_path(tmp_path, monkeypatch):
     assert len(set(paths)) == len(paths)
 
 
+def test_records_by_a_newer_sumo_are_others_and_said_to_be(tmp_path, monkeypatch):
+    monkeypatch.setattr(versions, "installed", lambda package: "1.100.2")
+    with pytest.warns(UserWarning, match=r"libsumo 1\.100\.2 is newer than .*'libsumo~=1\.\d+\.0'"):
+        path = RecordLibrary(tmp_path).record_path(SHORT_HIGHWAY, 0)
+    assert path.is_relative_to(tmp_path / f"records-v{library.RECORD_VERSION}-sumo-1.100.2")
+
+
 def test_a_library_pickles_as_its_path_which_the_environment_may_give(tmp_path, monkeypatch):
     tiny_record(tmp_path, 0)
     records = RecordLibrary(tmp_path, memory=7)
@@ -198,11 +205,8 @@ def test_a_library_that_cannot_grow_says_what_it_holds_and_why(tmp_path, monkeyp
 def test_a_missing_or_broken_libsumo_is_an_error_of_the_library(tmp_path, monkeypatch):
     tiny_record(tmp_path, 0)
 
-    def missing(name):
-        raise sumo.importlib.metadata.PackageNotFoundError(name)
-
     with monkeypatch.context() as patch:
-        patch.setattr(sumo.importlib.metadata, "version", missing)
+        patch.setattr(versions, "installed", lambda package: None)
         with pytest.raises(SumoVersionError, match=r"neither find nor make the 1 .*libsumo"):
             RecordLibrary(tmp_path).get(SHORT_HIGHWAY, 0)
     (tmp_path / "broken").mkdir()

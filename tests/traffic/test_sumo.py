@@ -161,11 +161,18 @@ def test_a_run_is_closed_however_it_ends():
     assert not libsumo.isLoaded()
 
 
-def test_another_release_series_is_refused(monkeypatch):
+@pytest.mark.parametrize(
+    ("version", "refused"),
+    [
+        ("1.18.0", r"must be 1\.28 or newer, found 1\.18\.0"),
+        ("1.100.0", r"reports version 1\.100\.0 but is installed as"),
+    ],
+)
+def test_a_libsumo_that_another_package_overwrote_is_refused(version, refused, monkeypatch):
     import libsumo
 
-    monkeypatch.setattr(libsumo, "getVersion", lambda: (22, "SUMO 1.29.0"))
-    with pytest.raises(SumoVersionError, match=r"series 1\.28, found 1\.29\.0"):
+    monkeypatch.setattr(libsumo, "getVersion", lambda: (22, f"SUMO {version}"))
+    with pytest.raises(SumoVersionError, match=refused):
         simulate(SHORT_HIGHWAY, 0)
 
 

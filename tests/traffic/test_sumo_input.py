@@ -7,6 +7,7 @@ import pytest
 
 from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY
 from dptse_env.traffic.sumo_input import (
+    NetconvertError,
     compile_net,
     edge_ids,
     net_xml,
@@ -40,6 +41,13 @@ def test_a_missing_netconvert_names_the_extra(monkeypatch):
 
     monkeypatch.setattr(importlib.util, "find_spec", without_sumo)
     with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[corridors\]'"):
+        compile_net(PAPER_HIGHWAY.replaced(n_mainline=21).geometry)
+
+
+@needs_netconvert
+def test_a_netconvert_of_another_version_than_libsumo_is_refused(monkeypatch):
+    monkeypatch.setattr("dptse_env.traffic.sumo_input.installed", lambda package: "1.2.3")
+    with pytest.raises(NetconvertError, match=r"found 1\.2\.3: pip install 'eclipse-sumo==1\."):
         compile_net(PAPER_HIGHWAY.replaced(n_mainline=21).geometry)
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from dptse_env import versions
 from dptse_env.utils.registry import EXTRAS, MissingExtraError, needed_for
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))
-BROUGHT_BY = {"sumo": "eclipse_sumo"}
+BROUGHT_BY = {"sumo": "eclipse_sumo", "pygame": "pygame_ce"}
 
 
 def test_each_extra_brings_its_modules_and_no_others():
@@ -19,6 +20,15 @@ def test_each_extra_brings_its_modules_and_no_others():
         requirements = PROJECT["project"]["optional-dependencies"][extra]
         brought = {re.split(r"[^\w-]", each)[0].replace("-", "_") for each in requirements}
         assert {BROUGHT_BY.get(module, module) for module in modules} == brought
+
+
+def test_each_package_has_one_range_of_versions():
+    project = PROJECT["project"]
+    every = sum(project["optional-dependencies"].values(), project["dependencies"])
+    ranges = {(re.split(r"[^\w-]", each)[0], each) for each in every if "dptse-env" not in each}
+    assert len(ranges) == len({name for name, _ in ranges})
+    tested = versions.TESTED_SUMO
+    assert {f"{each}>={tested}" for each in ("eclipse-sumo", "libsumo", "sumolib")} < set(every)
 
 
 def test_a_missing_module_names_its_extra(monkeypatch):
