@@ -4,7 +4,7 @@ dptse fit my-road.toml
 
 It records traffic that is missing, fits ARZ parameters by the filter's error on training traffic,
 chooses parameters, estimator and query policy on validation traffic, and plays them once on test
-traffic. The folder my-road-fit gets page.html, which says what to do next. With --tune it searches
+traffic. The folder my-road-fit gets fit.md, which says what to do next. With --tune it searches
 settings of estimators on training traffic instead, for the road or, without one, for --env, and
 writes a file for the keyword estimator_settings for each. The same command goes on after Ctrl-C.
 """
@@ -24,6 +24,7 @@ from tyro.conf import Positional
 
 from agents.environments import make_config, parse_env, quietly
 from agents.executors import make_executor
+from agents.fitting.budget import Errors, play_budgets
 from agents.fitting.choice import (
     ESTIMATORS_TRIED,
     FILTER,
@@ -32,7 +33,7 @@ from agents.fitting.choice import (
     ROUND_ROBIN,
     Choice,
 )
-from agents.fitting.page import Outcome, verdict, write
+from agents.fitting.page import PAGE, Outcome, verdict, write_page
 from agents.fitting.parameters import Fit, fit_parameters, is_stable, start_from, traffic_of
 from agents.fitting.road import PLAYED, Road, find_road, require_road, seeds_of
 from agents.fitting.road_file import copy_of, write_choice
@@ -44,11 +45,11 @@ from agents.tables import ERROR, Labels, values
 from agents.terminal import make_table
 from dptse_env.estimators import check_estimator
 from dptse_env.estimators.tuned import DEFAULT_PARAMETERS, tuned_with
-from dptse_env.model import ARZParameters, available_parameters, load_parameters
+from dptse_env.model import available_parameters, load_parameters
 from dptse_env.model.parameters import read_parameters, write_parameters
 from dptse_env.traffic import RecordLibrary, ranges
 from dptse_env.traffic.roads import from_home
-from dptse_env.utils.files import replacing, require_output, write_atomically
+from dptse_env.utils.files import replacing, require_output
 from dptse_env.utils.validation import integer, require
 from dptse_env.versions import code_version
 from scripts.cli import (
@@ -63,10 +64,10 @@ from scripts.cli import (
     ValidationSeeds,
 )
 
-PAGE, STAGES, SEARCH, JOURNAL = "page.html", "stages", "search.json", "trials.journal"
+STAGES, SEARCH, JOURNAL = "stages", "search.json", "trials.journal"
 STEPS = (
     "record traffic", "fit ARZ parameters", "choose parameters", "choose an estimator",
-    "choose a query policy", "evaluate on test traffic",
+    "choose a query policy", "evaluate on test traffic, and over bandwidth and epsilon",
 )  # fmt: skip
 
 
@@ -212,13 +213,15 @@ def fit_road(args: Args, path: Path) -> None:
     policies = args.policies or POLICIES_TRIED
     choice.choose([{"policy": each} for each in policies], place)
     begin()
-    rows = choice.play(test_cells(choice, estimators, policies), place)
+    played = choice.play(test_cells(choice, estimators, policies), place)
+    budgets = play_budgets(choice, place)
 
     keywords = chosen_keywords(choice, road)
     notes += [*inherits(choice, keywords), *road.remarks, *dict.fromkeys(choice.refused)]
-    sets = {each: arz(choice, each) for each in dict.fromkeys((choice.home, name))}
-    outcome = Outcome(choice, sets, density, speed, dwell, notes, commands(args, choice, folder))
-    write_atomically(folder / PAGE, write(outcome, rows, place))
+    sets = {each: choice.config(parameters=each).parameters for each in (choice.home, name)}
+    following = commands(args, choice, folder)
+    outcome = Outcome(choice, played, budgets, sets, density, speed, dwell, notes, following)
+    write_page(outcome, place, folder)
     changed = write_choice(
         path,
         {key: _in_file(path, value) for key, value in keywords.items()},
@@ -227,8 +230,8 @@ def fit_road(args: Args, path: Path) -> None:
     said = [verdict(choice), *(f"- {note}" for note in notes)]
     if changed:
         said.append(f"{path} has the table [environment] now; {copy} is as it was")
-    said.append(f"open {folder / PAGE} in a browser: it says what to do next")
-    args.answer(as_json(choice, keywords, notes, rows), *said)
+    said.append(f"{folder / PAGE} has the tables, and says what to do next")
+    args.answer(as_json(choice, keywords, notes, played, budgets), *said)
 
 
 def checked_road(args: Args, path: Path, folder: Path) -> Road:
@@ -258,7 +261,11 @@ def steps(args: Args) -> Callable[[], None]:
 
 
 def as_json(
-    choice: Choice, keywords: Mapping[str, Any], notes: Sequence[str], rows: Sequence[Labels]
+    choice: Choice,
+    keywords: Mapping[str, Any],
+    notes: Sequence[str],
+    played: Sequence[Labels],
+    budgets: Errors,
 ) -> dict[str, Any]:
     """Return what was chosen, and the errors x 1000 on each seed of test traffic."""
     return {
@@ -268,7 +275,11 @@ def as_json(
         "environment": keywords,
         "notes": notes,
         "test": [
-            {**labels, "error": values(choice.rows, labels, ERROR).tolist()} for labels in rows
+            {**labels, "error": values(choice.rows, labels, ERROR).tolist()} for labels in played
+        ],
+        "budgets": [
+            {"bandwidth": bandwidth, "epsilon": epsilon, "error": errors.tolist()}
+            for (bandwidth, epsilon), errors in budgets.items()
         ],
     }
 
@@ -376,12 +387,6 @@ def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:
         ),
     }
     return [said.get(key, f"{key} is of another road") for key in config.inherited]
-
-
-def arz(choice: Choice, name: str) -> ARZParameters:
-    """Return the ARZ parameters of a set."""
-    given = str(choice.sets[name]["parameters"])
-    return load_parameters(given) if given in available_parameters() else read_parameters(given)
 
 
 def commands(args: Args, choice: Choice, folder: Path) -> list[tuple[str, str]]:

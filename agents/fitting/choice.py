@@ -6,19 +6,22 @@ estimator with these parameters, the query policy with this estimator.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
+from agents.environments import make_config, quietly
 from agents.fitting.road import PLAYED, Road
 from agents.play import Cell
 from agents.seeds import CHOICE, EVALUATION, TUNING
 from agents.statistics import mean_interval
 from agents.study import Place, Study, play_study
-from agents.tables import ERROR, values
+from agents.tables import ERROR, Labels, give_or_take, values
+from dptse_env.config import EnvConfig
+from dptse_env.utils.arrays import FloatArray
 
 NAME = "fit"
 FILTER, ROUND_ROBIN = "ekf", "round-robin"
@@ -72,17 +75,25 @@ class Choice:
         inherited = self.road.inherited
         return inherited if inherited in self.sets else next(iter(self.sets))
 
-    def labels(self, traffic: str, **changes: str) -> dict[str, str]:
-        """Return the labels of what is chosen, with changes, on validation or test traffic."""
-        chosen = {"parameters": self.parameters, "estimator": self.estimator, "policy": self.policy}
-        return {"traffic": traffic, **chosen, **changes}
+    def labels(self, traffic: str, **changes: Any) -> dict[str, Any]:
+        """Return the labels of what is chosen, with changes, on a kind of traffic."""
+        config = self.road.config
+        return {
+            "traffic": traffic,
+            "parameters": self.parameters,
+            "estimator": self.estimator,
+            "policy": self.policy,
+            "bandwidth": config.bandwidth,
+            "epsilon": config.privacy.epsilon,
+            **changes,
+        }
 
-    def cell(self, labels: Mapping[str, str]) -> Cell:
-        """Return the cell of some labels."""
+    def cell(self, labels: Labels, seeds: Sequence[int] = ()) -> Cell:
+        """Return the cell of some labels, on given traffic or all of the kind that they name."""
         keywords = {
             **self.road.keywords,
             "corridor": str(self.stages / PLAYED),
-            "estimator": labels["estimator"],
+            **{key: labels[key] for key in ("estimator", "bandwidth", "epsilon")},
             **self.sets.get(labels["parameters"], {}),
         }
         noise = {"training": TUNING.start, "validation": CHOICE.start, "test": EVALUATION.start}
@@ -95,18 +106,26 @@ class Choice:
             noise_seed=noise[traffic],
             transferred=True,
             watchers=("honesty",),
-            seeds=self.road.seeds[traffic],
+            seeds=tuple(seeds) or self.road.seeds[traffic],
         )
 
-    def play(self, wanted: Sequence[Mapping[str, str]], place: Place) -> list[Mapping[str, str]]:
+    def config(self, **changes: Any) -> EnvConfig:
+        """Return the configuration of an episode of what is chosen, with changes of its labels."""
+        cell = self.cell(self.labels("test", **changes))
+        with quietly():
+            return make_config(cell.env, cell.all_keywords)
+
+    def play(
+        self, wanted: Sequence[Labels], place: Place, seeds: Sequence[int] = ()
+    ) -> list[Labels]:
         """Play cells, and return the labels of those that the environment does not refuse."""
         cells = {}
         for labels in wanted:
-            cell = self.cell(labels)
+            cell = self.cell(labels, seeds)
             try:
                 cell.check()
             except ValueError as problem:
-                tried = f"{labels['estimator']} with {labels['parameters']}, {labels['policy']}"
+                tried = ", ".join(f"{key} {value}" for key, value in [*labels.items()][1:])
                 self.refused.append(f"{tried}: {problem}")
             else:
                 cells[cell.id] = cell
@@ -114,11 +133,11 @@ class Choice:
         self.rows = play_study(study, place._replace(folder=self.stages))
         return [cell.labels for cell in cells.values()]
 
-    def best(self, played: Sequence[Mapping[str, str]]) -> Mapping[str, str]:
+    def best(self, played: Sequence[Labels]) -> Labels:
         """Return the labels of the smallest mean error."""
         return min(played, key=lambda labels: float(values(self.rows, labels, ERROR).mean()))
 
-    def choose(self, options: Sequence[Mapping[str, str]], place: Place) -> None:
+    def choose(self, options: Sequence[Labels], place: Place) -> None:
         """Play changes of what is chosen on validation traffic, and choose the best one.
 
         What is chosen stays unless the best one errs less with 95 % confidence, or the traffic has
@@ -131,13 +150,24 @@ class Choice:
         if not played:
             raise ValueError(f"{self.road.path}: {self.refused[-1]}")
         best, now = self.best(played), self.labels("validation")
-        if now not in played or self._is_less(best, now):
+        if now not in played or is_less(*(values(self.rows, each, ERROR) for each in (best, now))):
             self.parameters, self.estimator, self.policy = (
                 best[key] for key in ("parameters", "estimator", "policy")
             )
 
-    def _is_less(self, labels: Mapping[str, str], now: Mapping[str, str]) -> bool:
-        less, more = (values(self.rows, each, ERROR) for each in (labels, now))
-        if len(less) < FEW:
-            return bool(less.mean() < more.mean())
-        return bool(mean_interval(less - more).high < 0.0)
+
+def is_less(errors: FloatArray, others: FloatArray) -> bool:
+    """Return whether errors on the same traffic are smaller than others with 95 % confidence.
+
+    Of fewer than `FEW` seeds the means alone are compared.
+    """
+    if len(errors) < FEW:
+        return bool(errors.mean() < others.mean())
+    return bool(mean_interval(errors - others).high < 0.0)
+
+
+def interval(errors: FloatArray | None) -> str:
+    """Return mean and half of the 95 % interval, of one value that value, and of None a dash."""
+    if errors is None:
+        return "-"
+    return f"{errors.item():.1f}" if len(errors) < 2 else give_or_take(mean_interval(errors))

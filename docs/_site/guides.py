@@ -17,12 +17,12 @@ import sumolib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
+from matplotlib.patches import Rectangle
 
-from agents.figures import COLOURS, GRID_COLOUR, WIDTH, make_figure, save_figure
-from agents.fitting.page import draw_road
+from agents.figures import COLOURS, GRID_COLOUR, WIDTH, add_frame, make_figure, save_figure
 from dptse_env.importers.sumo_net import Files, Segmentation, segment_path
 from dptse_env.schedules import make_schedule
-from dptse_env.traffic import read_corridor
+from dptse_env.traffic import Corridor, read_corridor
 from dptse_env.utils.arrays import FloatArray
 
 DOCS = Path(__file__).parents[1]
@@ -98,6 +98,51 @@ def add_number(axis: Axes, line: FloatArray, number: str, above: bool) -> None:
     )  # fmt: skip
 
 
+def draw_road(corridor: Corridor) -> Figure:
+    """Draw segments to scale along the road, lanes across it, ramps beside it, and sensors."""
+    n, lengths = corridor.geometry.n_mainline, np.array(corridor.geometry.segment_lengths)
+    starts = np.concatenate([[0.0], np.cumsum(lengths[:n])])
+    figure = make_figure(9.0, 2.4, dpi=120)
+    axis = figure.subplots()
+    most = corridor.geometry.most_lanes
+
+    def box(segment: int, left: float, bottom: float, colour: str) -> None:
+        width, lanes = float(lengths[segment]), corridor.geometry.segment_lanes[segment]
+        axis.add_patch(Rectangle((left, bottom), width, lanes, facecolor=colour, edgecolor="white"))
+        middle = (left + width / 2, bottom + lanes / 2)
+        axis.annotate(f"{segment}", middle, ha="center", va="center", fontsize=7)
+        if segment in corridor.fixed_sensors:
+            axis.plot(left + width / 2, bottom + lanes - 0.25, "v", color=COLOURS[1], markersize=5)
+
+    for segment in range(n):
+        box(segment, float(starts[segment]), 0.0, "#c9d6e3")
+    groups = [(*corridor.geometry.on_ramps, *corridor.geometry.off_ramps)]
+    ramps = (*corridor.geometry.on_ramp_segments, *corridor.geometry.off_ramp_segments)
+    for face, segments in zip(*groups, ramps, strict=True):
+        joins = segments[0] in {s for each in corridor.geometry.on_ramp_segments for s in each}
+        left = float(starts[face])
+        if joins:
+            left -= float(lengths[list(segments)].sum())
+        for segment in segments:
+            box(segment, left, -1.6 - corridor.geometry.segment_lanes[segment], "#e3d6c9")
+            left += float(lengths[segment])
+        place = float(starts[face])
+        ends = ((place, -0.05), (place, -1.5)) if joins else ((place, -1.5), (place, -0.05))
+        axis.annotate("", *ends, arrowprops={"arrowstyle": "->", "color": "#777"})
+    limits = corridor.geometry.speed_limits[:n]
+    for segment in range(n):
+        if segment == 0 or limits[segment] != limits[segment - 1]:
+            at = (float(starts[segment]), most + 0.3)
+            axis.annotate(f"{limits[segment]:g} km/h", at, fontsize=7, color="#555")
+    axis.set_xlim(-0.02 * starts[-1], 1.02 * starts[-1])
+    axis.set_ylim(-4.2 if corridor.geometry.n_ramps else -0.6, most + 1.2)
+    axis.set_yticks([])
+    axis.set_xlabel("road [km]; traffic goes right, triangles are fixed sensors", fontsize=8)
+    add_frame(axis, "x")
+    axis.spines["left"].set_visible(False)
+    return figure
+
+
 def draw_frame(path: Path, seconds: int = 420) -> None:
     """Save what an environment renders when some seconds of an episode are over."""
     env = gym.make("dptse_env:dptse/PrivateHighway-v1", render_mode="rgb_array")
@@ -117,7 +162,6 @@ def draw_guides() -> None:
         folder = Path(name)
         write_files("your-road.md", folder)
         road = draw_road(read_corridor(folder / "my-road.toml"))
-        road.set_size_inches(WIDTH, 2.4)
         save_figure(road, images / "road.png", "")
         write_files("your-network.md", folder)
         words = "--node-files town.nod.xml --edge-files town.edg.xml --output-file town.net.xml"

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import sys
 import tomllib
@@ -16,6 +17,7 @@ pytest.importorskip("tomlkit")
 from agents.executors import this_process
 from agents.fitting import choice as choosing
 from agents.fitting import parameters as searching
+from agents.fitting.budget import advice, budget_table
 from agents.fitting.choice import Choice
 from agents.fitting.parameters import fit_parameters, start_from
 from agents.fitting.road import find_road
@@ -94,13 +96,53 @@ def set_of(path):
     return str(path.parent / "my-road-fit" / "my-road.json")
 
 
-def test_the_page_shows_road_choice_and_commands(fitted):
+def test_the_page_shows_choice_budgets_figures_and_commands(fitted):
     path, found = fitted
-    page = (path.parent / "my-road-fit" / "page.html").read_text(encoding="utf-8")
-    assert page.count("<img ") == 3
-    for name in ("w99-3lane", "random_walk", "oldest-first", "dptse train", found["policy"]):
-        assert name in page
-    assert all(note.split(":")[0] in page for note in found["notes"])
+    folder = path.parent / "my-road-fit"
+    page = (folder / "fit.md").read_text(encoding="utf-8")
+    assert all((folder / name).is_file() for name in re.findall(r"!\[.*\]\((.*)\)", page))
+    heading = "PrivateHighway-v1, road my-road (fixed sensors none), parameters"
+    for text in (heading, "bandwidth 1", "random_walk", "oldest-first", "dptse train"):
+        assert text in page
+    assert f"**{found['policy']}**" in page
+    assert all(note in page for note in found["notes"])
+    assert len(found["budgets"]) == 4 * 5
+    header, _, *rows = re.search(r"(^\| bandwidth.*\n)(^\|.*\n)+", page, re.MULTILINE)[
+        0
+    ].splitlines()
+    assert header.split(" | ")[1:] == ["ε = 0.5", "ε = 1", "ε = 2", "ε = 5", "ε = 10 |"]
+    assert [row.split(" | ")[0] for row in rows] == ["| no queries", "| 1", "| 2", "| 4"]
+    mean = np.mean(chosen_errors(found))
+    assert rows[1].split(" | ")[4].startswith(f"{mean:.1f} ± ")
+
+
+def chosen_errors(found):
+    keys = "parameters", "estimator", "policy"
+    (own,) = (each for each in found["test"] if all(each[k] == found[k] for k in keys))
+    return own["error"]
+
+
+ERRORS = {
+    (0, 1.0): [80, 82, 84, 86], (0, 5.0): [80, 82, 84, 86],
+    (1, 1.0): [79, 83, 84, 86], (1, 5.0): [60, 61, 62, 63],
+    (2, 1.0): [90, 91, 92, 93], (2, 5.0): [50, 51, 52, 53], (4, 5.0): [49, 51, 52, 53],
+}  # fmt: skip
+
+
+def test_advice_says_where_queries_stop_paying():
+    errors = {key: np.array(values, float) for key, values in ERRORS.items()}
+    said = advice(errors, 5.0)
+    assert "least at bandwidth 4 and ε = 5. At the environment's ε = 5" in said
+    assert "least at bandwidth 4, and beyond 2 it gets no smaller for certain" in said
+    assert "At ε = 1 queries do not pay: none helps for certain" in said
+    assert "| no queries | 83.0 ± 4.1 | 83.0 ± 4.1 |" in budget_table(errors)
+    assert budget_table(errors).endswith("| 4 | - | 51.2 ± 2.7 |")
+    paid = {key: each for key, each in errors.items() if key[1] == 5.0}
+    assert "At each of these ε queries pay" in advice(paid, 5.0)
+    queried = {key: each for key, each in errors.items() if key[0]}
+    assert "No episode without queries can be played" in advice(queried, 5.0)
+    same = {(b, e): errors[b, 5.0] for b, _ in errors for e in (1.0, 5.0)}
+    assert "Errors do not depend on ε" in advice(same, 1.0)
 
 
 def test_the_same_command_plays_nothing_again_and_changes_no_file_of_yours(fitted, tmp_path):
@@ -114,7 +156,7 @@ def test_the_same_command_plays_nothing_again_and_changes_no_file_of_yours(fitte
     assert again["environment"].items() <= found["environment"].items()
     after = files_of(path.parent)
     changed = {each.name for each in after if after[each] != before.get(each)}
-    assert changed <= {"page.html", "rows.parquet"}
+    assert changed <= {"fit.md", "speed-density.png", "episode.png", "rows.parquet"}
     line = refused("fit", path, *BRIEF, "--train-seeds", "0:1")
     assert "seeds.training is [0, 1] there and [0] now" in line
 
@@ -347,7 +389,7 @@ def test_a_measured_field_with_one_test_window_is_fitted(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "release model 'corrected', since a measured field has no vehicles" in done.stdout
     assert tomllib.loads(path.read_text())["environment"]["privacy"] == "corrected"
-    page = (path.parent / "road-fit" / "page.html").read_text(encoding="utf-8")
+    page = (path.parent / "road-fit" / "fit.md").read_text(encoding="utf-8")
     assert "There is one test window: its errors have no interval" in page
     with pytest.warns(UserWarning, match="^estimator_settings: "):
         env = gym.make(ID, corridor=str(path))

@@ -131,7 +131,7 @@ def test_a_road_file_becomes_a_compared_policy(run_guide):
     printed, _ = run_guide("your-road.md")
     chosen = tomllib.loads(Path("my-road.toml").read_text(encoding="utf-8"))["environment"]
     assert f"\n{chosen['estimator']} [" in printed
-    page = Path("my-road-fit/page.html").read_text(encoding="utf-8")
+    page = Path("my-road-fit/fit.md").read_text(encoding="utf-8")
     assert all(each in page for each in ("dptse train", "dptse evaluate", "dptse fit --tune"))
     assert "best" in Path("my-road-fit/comparison/tables.md").read_text(encoding="utf-8")
 
@@ -143,7 +143,7 @@ def test_a_network_becomes_a_fitted_road(run_guide):
     assert "on-ramp at face 4: on" in printed
     road = read_corridor("town/road.toml")
     assert (road.geometry.n_mainline, road.geometry.off_ramps) == (15, (11,))
-    assert Path("town/road-fit/page.html").is_file()
+    assert Path("town/road-fit/fit.md").is_file()
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ COMMANDS = {
     ),
     "evaluate --suite short": (["--policies", "speed-front", *ONE], "card.json"),
     "study": (["examples.my_study:STUDY", *ONE], "tables.md"),
-    "fit": (["road.toml", *ONE], "page.html"),
+    "fit": (["road.toml", *ONE], "fit.md"),
     "audit": (["--env", SHORT, *ONE], "printed-worst-case-hunter.json"),
     "record": (["--env", SHORT, "--train-seeds", "0"], None),
     "import trajectories": (
