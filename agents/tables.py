@@ -115,6 +115,23 @@ def values(rows: pl.DataFrame, labels: Labels, metric: str) -> FloatArray:
     return values_of(pick(rows, labels), metric)
 
 
+def paired(rows: pl.DataFrame, *groups: tuple[str, Sequence[Labels]]) -> list[FloatArray]:
+    """Return columns of groups of cells, all paired as `pick_paired` does.
+
+    Args:
+        rows: Rows of a study.
+        *groups: A column, or `ERROR`, with the labels of cells.
+
+    Returns:
+        For each group an array (n_cells, n_traffic_seeds).
+
+    Raises:
+        UnmeasuredError, ValueError: See `pick_paired`.
+    """
+    found = iter(pick_paired(rows, *(labels for _, cells in groups for labels in cells)))
+    return [np.stack([values_of(next(found), metric) for _ in cells]) for metric, cells in groups]
+
+
 def mean(rows: pl.DataFrame, labels: Labels, metric: str) -> Interval:
     """Return the mean of a column of a cell over its traffic seeds, with its 95 % interval."""
     return mean_interval(values(rows, labels, metric))
@@ -122,8 +139,8 @@ def mean(rows: pl.DataFrame, labels: Labels, metric: str) -> Interval:
 
 def difference(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str) -> Interval:
     """Return by how much a cell exceeds a reference, paired by traffic and noise."""
-    own, other = (values_of(each, metric) for each in pick_paired(rows, labels, reference))
-    return mean_interval(own - other)
+    own, other = paired(rows, (metric, [labels]), (metric, [reference]))
+    return mean_interval(own[0] - other[0])
 
 
 def below(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str = ERROR) -> Interval:
@@ -131,9 +148,14 @@ def below(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str = E
 
     The interval is that of the difference over the mean of the reference.
     """
-    own, other = (values_of(each, metric) for each in pick_paired(rows, labels, reference))
-    scale, found = 100.0 / float(other.mean()), mean_interval(other - own)
+    own, other = paired(rows, (metric, [labels]), (metric, [reference]))
+    scale, found = 100.0 / float(other.mean()), mean_interval(other[0] - own[0])
     return Interval(scale * found.mean, scale * found.low, scale * found.high, found.n)
+
+
+def chi2(rows: pl.DataFrame, labels: Labels) -> list[float]:
+    """Return the mean squares of errors over deviations, of densities and of speeds."""
+    return [mean(rows, labels, f"chi2_{kind}").mean for kind in ("density", "speed")]
 
 
 def markdown(
@@ -155,6 +177,13 @@ def grid(
         [corner, *map(str, columns)],
         [[str(row), *(cell(entry, row, column) for column in columns)] for row in rows],
     )
+
+
+def table(
+    corner: str, lines: Mapping[str, Any], columns: Mapping[str, Callable[[Any], str]]
+) -> str:
+    """Return a `grid` of what each column gives for the subject of each line."""
+    return grid(corner, list(lines), list(columns), lambda name, head: columns[head](lines[name]))
 
 
 def cell(entry: Callable[..., str], *arguments: Any) -> str:

@@ -6,13 +6,12 @@ All look at the true traffic, for evaluation only.
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
 
 from dptse_env.evaluation import WARM_UP, Row, WatcherFactory
 from dptse_env.process import QueryProcess
 from dptse_env.release import Capped, Paced
 from dptse_env.release.vehicles import VehicleRows
-from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
+from dptse_env.utils.arrays import AnyArray, BoolArray
 
 LENGTHS = (0, 30, 60, 90, 120, 150, 180)
 """Lengths of trips [s] at which their bins begin; the last has no end."""
@@ -100,36 +99,19 @@ class Contributions:
         }
 
 
-LEVELS = (50, 90, 95)
-"""Nominal coverage of intervals [%]."""
-REGIMES = ("jam", "front", "free")
-"""Regimes of a segment in a second: at a front its speed and a neighbour's differ by more than
-`JUMP`; elsewhere it is in a jam below `SLOW`, or else in free flow."""
-JUMP, SLOW = 30.0, 50.0
-"""Speeds [km/h]."""
-
-
 class Honesty:
     """Honesty of the estimates of a batch of episodes, after the warm-up.
 
     Columns:
 
     - ``chi2_density``, ``chi2_speed``: mean squares of errors over their reported deviations,
-      speeds of occupied segments only;
-    - ``density_50``, ..., ``speed_95``: values within the reported interval of 50, 90, 95 % [%];
-    - for each of `REGIMES` ``n_jam``, the seconds of segments in it, and ``density_jam`` and
-      ``speed_jam``, the sums of their squared errors [(veh/km)^2, (km/h)^2].
+      speeds of occupied segments only.
     """
 
     def __init__(self, process: QueryProcess) -> None:
         """Begin with nothing."""
-        self._process, n = process, process.n_episodes
-        self._cells, self._occupied = np.zeros(n), np.zeros(n)
-        self._chi2 = np.zeros((n, 2))
-        self._inside = np.zeros((n, 2, len(LEVELS)))
-        self._counts = np.zeros((n, len(REGIMES)))
-        self._squares = np.zeros((n, len(REGIMES), 2))
-        self._bounds = stats.norm.ppf(0.5 + np.array(LEVELS) / 200.0)
+        self._process, shape = process, (process.n_episodes, 2)
+        self._counts, self._squares = np.zeros(shape), np.zeros(shape)
 
     def __call__(self) -> None:
         """Add the present second, unless it is part of the warm-up."""
@@ -144,45 +126,16 @@ class Honesty:
         counts = np.stack([np.ones_like(occupied), occupied], -1)
         error = np.where(counts, means - truth, 0.0)
         with np.errstate(divide="ignore"):  # an estimator of somebody's own may claim to be exact
-            ratio = np.divide(np.abs(error), spread, out=np.zeros_like(error), where=error != 0.0)
-        self._cells += n
-        self._occupied += occupied.sum(axis=1)
-        self._chi2 += np.sum(ratio**2, axis=1)
-        within = (ratio[..., None] <= self._bounds) & counts[..., None]
-        self._inside += within.sum(axis=1)
-        for k, members in enumerate(regimes(truth[..., 1], occupied)):
-            self._counts[:, k] += members.sum(axis=1)
-            self._squares[:, k] += np.sum(error**2 * members[..., None], axis=1)
+            ratio = np.divide(error, spread, out=np.zeros_like(error), where=error != 0.0)
+        self._counts += counts.sum(axis=1)
+        self._squares += np.sum(ratio**2, axis=1)
 
     def rows(self) -> list[Row]:
         """See `dptse_env.evaluation.Watcher.rows`."""
-        totals = np.stack([self._cells, np.maximum(self._occupied, 1.0)], axis=-1)
-        chi2, inside = self._chi2 / totals, 100.0 * self._inside / totals[..., None]
-        columns = {f"n_{regime}": self._counts[:, j] for j, regime in enumerate(REGIMES)}
-        for i, kind in enumerate(("density", "speed")):
-            columns[f"chi2_{kind}"] = chi2[:, i]
-            for j, level in enumerate(LEVELS):
-                columns[f"{kind}_{level}"] = inside[:, i, j]
-            for j, regime in enumerate(REGIMES):
-                columns[f"{kind}_{regime}"] = self._squares[:, j, i]
-        names, values = columns.keys(), np.stack([*columns.values()], axis=-1)
-        return [dict(zip(names, row, strict=True)) for row in values.tolist()]
-
-
-def regimes(speed: FloatArray, occupied: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Return the members of `REGIMES` among occupied segments, shape (n, N) each.
-
-    Args:
-        speed: True speeds [km/h], shape (n, N).
-        occupied: Flags, shape (n, N).
-    """
-    jumps = np.abs(np.diff(speed, axis=1)) > JUMP
-    jumps &= occupied[:, 1:] & occupied[:, :-1]
-    front = np.zeros_like(occupied)
-    front[:, 1:] |= jumps
-    front[:, :-1] |= jumps
-    jam = occupied & ~front & (speed < SLOW)
-    return jam, front, occupied & ~front & ~jam
+        chi2 = self._squares / np.maximum(self._counts, 1.0)
+        return [
+            dict(zip(("chi2_density", "chi2_speed"), row, strict=True)) for row in chi2.tolist()
+        ]
 
 
 class Summary:

@@ -12,7 +12,6 @@ from agents.watchers import (
     LENGTHS,
     Contributions,
     Honesty,
-    regimes,
 )
 from dptse_env.estimators import Estimate
 from dptse_env.evaluation import evaluate
@@ -107,15 +106,6 @@ def test_a_release_model_without_accounts_is_refused():
         Contributions(SimpleNamespace(release=release))
 
 
-def test_regimes_part_the_occupied_segments():
-    speed = np.array([[90.0, 95.0, 40.0, 30.0, 20.0, 0.0, 100.0, 90.0]])
-    occupied = np.array([[True] * 5 + [False] + [True] * 2])
-    jam, front, free = regimes(speed, occupied)
-    assert front.tolist() == [[False, True, True, False, False, False, False, False]]
-    assert jam.tolist() == [[False, False, False, True, True, False, False, False]]
-    assert free.tolist() == [[True, False, False, False, False, False, True, True]]
-
-
 class Process:
     """Two episodes of one mainline segment and a ramp, whose estimates miss by given errors."""
 
@@ -145,12 +135,6 @@ def test_deviations_are_held_against_errors():
     assert first["chi2_density"] == pytest.approx(0.25)
     assert first["chi2_speed"] == pytest.approx(1 / 16)
     assert second["chi2_density"] == pytest.approx(0.5 * (2.0**2 + 0.0))
-    assert (first["density_50"], first["density_95"]) == (100.0, 100.0)
-    assert (second["density_90"], second["density_95"]) == (50.0, 50.0)  # 2 deviations exceed 1.96
-    assert second["speed_50"] == 50.0
-    assert (first["n_free"], first["n_jam"], first["n_front"]) == (2.0, 0.0, 0.0)
-    assert first["density_free"] == pytest.approx(2.0)
-    assert second["speed_free"] == pytest.approx(16.0)
 
 
 def test_the_warm_up_and_speeds_of_empty_segments_do_not_count():
@@ -165,7 +149,6 @@ def test_the_warm_up_and_speeds_of_empty_segments_do_not_count():
     found = watcher.rows()[0]
     assert found["chi2_density"] == pytest.approx(1.0)
     assert found["chi2_speed"] == 0.0
-    assert found["n_free"] == 0.0
 
 
 @pytest.mark.parametrize("privacy", [PACED, "printed"])

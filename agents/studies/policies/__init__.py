@@ -16,11 +16,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
-from itertools import chain, product
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import polars as pl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -49,10 +48,9 @@ from agents.tables import (
     Labels,
     UnmeasuredError,
     grid,
-    pick_paired,
+    paired,
     tenths,
     values,
-    values_of,
 )
 from dptse_env.config import parse_seeds
 from dptse_env.utils.arrays import FloatArray
@@ -205,16 +203,13 @@ def test_cells(rows: pl.DataFrame, place: Place) -> list[Cell]:
     return cells
 
 
-# What is measured: tables of training seeds by traffic seeds.
+# What is measured: errors by training seeds and traffic seeds.
 
 
-def tables(rows: pl.DataFrame, metric: str, *groups: Labels) -> list[FloatArray]:
-    """Return a column of groups of cells, paired by traffic as `pick_paired` does.
+def measure(rows: pl.DataFrame, statistic: Statistic, *groups: Labels) -> Interval:
+    """Return a statistic of the errors of groups, by training seeds crossed with traffic.
 
     A group has the cells of all training seeds.
-
-    Returns:
-        For each group an array (n_training_seeds, n_traffic_seeds).
 
     Raises:
         UnmeasuredError: No version has played all on two traffic seeds.
@@ -226,13 +221,7 @@ def tables(rows: pl.DataFrame, metric: str, *groups: Labels) -> list[FloatArray]
         if seeds.is_empty():
             raise UnmeasuredError(dict(labels))
         cells.append([{**labels, "training_seed": seed} for seed in seeds])
-    found = iter(pick_paired(rows, *chain.from_iterable(cells)))
-    return [np.stack([values_of(next(found), metric) for _ in own]) for own in cells]
-
-
-def measure(rows: pl.DataFrame, statistic: Statistic, *groups: Labels) -> Interval:
-    """Return a statistic of the errors of groups, by training seeds crossed with traffic."""
-    return bootstrap(statistic, *tables(rows, ERROR, *groups))
+    return bootstrap(statistic, *paired(rows, *((ERROR, group) for group in cells)))
 
 
 def read_curves(folder: Path) -> pl.DataFrame:

@@ -34,9 +34,10 @@ from agents.tables import (
     UnmeasuredError,
     below,
     cell,
+    chi2,
     give_or_take,
-    grid,
     mean,
+    table,
     tenths,
 )
 from dptse_env.estimators.recurrent import member_for, shipped_weights
@@ -228,11 +229,6 @@ def learned_in(rows: pl.DataFrame) -> list[Learned]:
     return [*SHIPPED, *(Learned(RECURRENT, name) for name in own["network"].unique().sort())]
 
 
-def chi2(rows: pl.DataFrame, labels: Labels) -> list[float]:
-    """Return the mean squares of errors over deviations, of densities and of speeds."""
-    return [mean(rows, labels, f"chi2_{kind}").mean for kind in ("density", "speed")]
-
-
 def table_of(rows: pl.DataFrame, learned: Learned) -> str:
     """Return the table of an estimator with weights beside the filters."""
     own = learned.estimator
@@ -257,7 +253,7 @@ def table_of(rows: pl.DataFrame, learned: Learned) -> str:
         "density RMSE over EKF's": density_ratio,
     }
     heads = {f"{line[0]}{'*' * (line[0] in KEPT_BACK)}, {line[1]}": line for line in lines()}
-    return grid("", list(heads), list(columns), lambda name, head: columns[head](heads[name]))
+    return table("", heads, columns)
 
 
 def summary(rows: pl.DataFrame, learned: Learned) -> str:

@@ -36,12 +36,9 @@ def test_tables_have_the_numbers_of_the_rows_and_dashes_for_the_rest(some):
     reward = network["reward"].mean()
     error, gain = -1000.0 * reward, 100.0 * (1.0 - reward / ekf["reward"].mean())
     start = f"| PrivateHighway-v1, recurrent | {error:.1f} ["
-    (line,) = [x for x in lines if x.startswith(start) and ";" in x]
+    (line,) = [x for x in lines if x.startswith(start) and x.count("|") == 7]
     assert f"] | {gain:.2f} [" in line
-    assert f" | {network['chi2_density'].mean():.2f}, {network['chi2_speed'].mean():.2f} | " in line
-    sums = network.select(pl.col(f"{name}_jam").sum() for name in ("density", "speed", "n")).row(0)
-    jam = " / ".join(f"{np.sqrt(squares / sums[2]):.1f}" for squares in sums[:2])
-    assert any(x.startswith(f"| PrivateHighway-v1, recurrent | {jam} | ") for x in lines)
+    assert f" | {network['chi2_density'].mean():.2f}, {network['chi2_speed'].mean():.2f} |" in line
     assert "| PrivateHighway-v1, UKF | - | - | - | - | - | - |" in lines
     assert "| paced, EKF | - | - | - | - | - |" in lines
 
@@ -56,7 +53,7 @@ def test_figures_are_there_where_all_that_they_show_was_played(some, tmp_path):
 
 def test_losses_are_those_of_the_mean_over_faults(recorded):
     healthy = pick(recorded, sensed("printed", "ekf"))["reward"].to_numpy()
-    cells = study.miscounting("printed", "ekf", *study.FACTORS)
+    cells = study.miscounting("printed", "ekf")
     faulty = np.mean([pick(recorded, each)["reward"].to_numpy() for each in cells], axis=0)
     found = study.loss(recorded, cells, sensed("printed", "ekf"))
     assert len(cells) == 6
@@ -80,13 +77,10 @@ def test_sensors_alone_have_the_budget_that_they_are_said_to_have():
 
 
 def test_faults_are_those_of_one_detector():
-    high, low, without = (
-        study.sensed_cell(study.miscounting("printed", "ekf", fault)[1])
-        for fault in ("high", "low", study.WITHOUT)
-    )
+    high, low = (study.sensed_cell(study.miscounting("printed", "ekf")[k]) for k in (1, 4))
     assert high.keywords["detectors"]["factor"] == pytest.approx([1.0, 4.0 / 3.0, 1.0])
     assert low.keywords["detectors"]["factor"] == pytest.approx([1.0, 2.0 / 3.0, 1.0])
-    assert corridor_of(without).fixed_sensors == (3, 11)
+    assert corridor_of(low).fixed_sensors == (3, 7, 11)
     queries = study.sensed_cell(sensed("printed", "ekf", sensors=study.QUERIES))
     assert corridor_of(queries).fixed_sensors == ()
 
@@ -108,11 +102,5 @@ def test_it_plays_and_reports(tmp_path):
     run(small, Place(tmp_path, this_process), progress=False)
     rows = read_rows("estimators", tmp_path)
     assert len(rows) == 4
-    squares, n = (
-        rows.select(pl.sum_horizontal(f"{kind}_{each}" for each in study.REGIMES)).to_series()
-        for kind in ("speed", "n")
-    )
-    errors = (squares / n).sqrt().to_list()
-    assert errors == pytest.approx(rows["rmse_speed"].to_list(), rel=1e-4)
     error = -1000.0 * rows.filter(estimator="ekf")["reward"].mean()
     assert f"| ShortHighway-v0 | {error:.1f} [" in (tmp_path / "tables.md").read_text("utf-8")
