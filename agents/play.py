@@ -12,7 +12,7 @@ from typing import Any
 from filelock import FileLock
 
 from agents.environments import make_config, make_vector, quietly
-from agents.policies import NamedSchedule, find_policy
+from agents.policies import find_policy
 from agents.watchers import WATCHERS
 from dptse_env.estimators.recurrent import member_for, read_weights, shipped_weights
 from dptse_env.evaluation import WARM_UP, Row, evaluate
@@ -72,7 +72,7 @@ class Cell:
         acts = source.deterministic if self.deterministic is None else self.deterministic
         content = {
             "env": self.env,
-            "policy": identity if isinstance(source, NamedSchedule) else f"sha256:{identity}",
+            "policy": identity if source.is_schedule else f"sha256:{identity}",
             "keywords": _with_digests(self.keywords),
             "noise_seed": self.noise_seed,
             "deterministic": acts,
@@ -168,7 +168,7 @@ def play(
         env = make_vector(cell.env, len(seeds), {**cell.all_keywords, **more})
     record(env.config.corridor, seeds, records)
     policy = cell.load_policy(env)
-    if not isinstance(find_policy(cell.policy), NamedSchedule):
+    if not find_policy(cell.policy).is_schedule:
         import torch  # noqa: PLC0415 (schedules alone do without)
 
         torch.manual_seed(POLICY_SEED)

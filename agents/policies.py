@@ -10,8 +10,7 @@ import importlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any
 
 from dptse_env.evaluation import Policy
 from dptse_env.policies import DETERMINISTIC, SUFFIX, read_policy, shipped_policies
@@ -21,118 +20,81 @@ from dptse_env.utils.registry import require_registered
 
 
 @dataclass(frozen=True)
-class NamedSchedule:
-    """A query schedule by its name, or its class as ``"module:Class"``."""
+class NamedPolicy:
+    """A query policy before it is bound to an environment.
+
+    Attributes:
+        source: The file of a saved policy, the name of one that comes with the package, or else a
+            schedule: its name or ``"module:Class"``.
+        card: Description of a saved policy, see `dptse_env.policies.PolicyFile`; None for a
+            schedule.
+    """
 
     source: str
-    deterministic: ClassVar[bool] = True
+    card: Mapping[str, Any] | None = None
 
     @property
-    def keywords(self) -> dict[str, Any]:
-        """Keywords of the environment that it fits: none, schedules speak every encoding."""
-        return {}
+    def is_schedule(self) -> bool:
+        """True for what was not trained."""
+        return self.card is None
 
     @property
     def identity(self) -> str:
-        """The name; of a class the digest of its module, too.
+        """The name of a schedule, of a class with its module's digest; a saved policy's digest.
 
         Raises:
             ValueError: The module cannot be imported.
         """
+        if self.card is not None:
+            return str(self.card["sha256"])
         if ":" not in self.source:
             return self.source
-        file = _imported(self.source).__file__
+        try:
+            file = importlib.import_module(self.source.partition(":")[0]).__file__
+        except Exception as problem:
+            raise ValueError(
+                f"{self.source!r} cannot be imported: {type(problem).__name__}: {problem}"
+            ) from problem
         return self.source if file is None else f"{self.source} {file_digest(file)}"
-
-    def load(self, env: Any, *, allow: Collection[str] = (), seed: int | None = None) -> Policy:
-        """Bind the schedule to an environment, see `dptse_env.schedules.make_schedule`.
-
-        Raises:
-            ValueError: The name is unknown or the schedule does not suit the environment.
-        """
-        policy: Policy = make_schedule(self.source, env, seed)
-        return policy
-
-
-def _imported(source: str) -> ModuleType:
-    """Return the module of ``"module:Name"``; whatever it raises is a `ValueError`."""
-    try:
-        return importlib.import_module(source.partition(":")[0])
-    except Exception as problem:
-        raise ValueError(
-            f"{source!r} cannot be imported: {type(problem).__name__}: {problem}"
-        ) from problem
-
-
-@dataclass(frozen=True)
-class SavedPolicy:
-    """A saved policy, as far as its file can be read without torch.
-
-    Attributes:
-        source: The file, or the name of a policy that comes with the package.
-        card: Description of the policy, see `dptse_env.policies.PolicyFile`.
-    """
-
-    source: str
-    card: Mapping[str, Any]
-
-    @property
-    def identity(self) -> str:
-        """Digest that tells policies apart whatever their files are called."""
-        return str(self.card["sha256"])
 
     @property
     def keywords(self) -> dict[str, Any]:
         """Keywords of the environment that it fits: its actions, and its observation if named.
 
+        Schedules speak every encoding.
+
         Raises:
             ValueError: A block of the observation is no registered name.
         """
-        own: dict[str, Any] = {"action": self.action}
+        if self.card is None:
+            return {}
+        own: dict[str, Any] = {"action": self.card["fits"]["action"]}
         if (blocks := self.card["keywords"].get("observation")) is not None:
             require_registered(blocks, f"{self.source}: keywords.observation")
             own["observation"] = blocks
         return own
 
     @property
-    def action(self) -> str:
-        """The action encoding of the policy."""
-        return str(self.card["fits"]["action"])
-
-    @property
     def deterministic(self) -> bool:
         """True if it takes its likeliest action unless told otherwise."""
-        return bool(self.card["acts"] == DETERMINISTIC)
-
-    @property
-    def recipe(self) -> str:
-        """Name of the recipe that trained it."""
-        return str(self.card["training"]["learner"])
-
-    @property
-    def training_seed(self) -> int:
-        """Seed of its training."""
-        return int(self.card["training"]["seed"])
+        return self.card is None or bool(self.card["acts"] == DETERMINISTIC)
 
     def load(self, env: Any, *, allow: Collection[str] = (), seed: int | None = None) -> Policy:
-        """Bind the policy to an environment, see `dptse_env.sb3.load_policy`.
+        """Bind it to an environment.
+
+        See `dptse_env.schedules.make_schedule` and `dptse_env.sb3.load_policy`.
 
         Raises:
-            ValueError: It does not fit the environment, or the file has changed since.
+            ValueError: It is unknown or does not fit the environment.
         """
-        from dptse_env.sb3 import load_policy  # noqa: PLC0415
+        policy: Policy
+        if self.card is None:
+            policy = make_schedule(self.source, env, seed)
+        else:
+            from dptse_env.sb3 import load_policy  # noqa: PLC0415
 
-        present = read_policy(self.source).identity
-        if present != self.identity:
-            raise ValueError(
-                f"{self.source!r} has changed: sha256 {present}, it was {self.identity}"
-            )
-        policy: Policy = load_policy(self.source, env, allow=allow)
+            policy = load_policy(self.source, env, allow=allow)
         return policy
-
-
-PolicySource = NamedSchedule | SavedPolicy
-"""A query policy before it is bound to an environment."""
 
 
 def policy_name(source: str) -> str:
@@ -144,35 +106,15 @@ def policy_name(source: str) -> str:
     return f"{path.parent.name}/{path.stem}" if path.suffix == SUFFIX else source
 
 
-def find_policy(source: str) -> PolicySource:
+def find_policy(source: str) -> NamedPolicy:
     """Return the policy that a name or a file stands for.
 
-    Args:
-        source: The ``.safetensors`` file of a saved policy, the name of one that comes with the
-            package, or else a schedule: its name or ``"module:Class"``. Whether a schedule exists
-            and suits an environment is checked when it is loaded.
+    A schedule is looked for when it is loaded.
 
     Raises:
         FileNotFoundError: There is no such saved policy.
         ValueError: The file is not a saved policy.
     """
     if source.endswith((SUFFIX, ".zip")) or source in shipped_policies():
-        return read_saved_policy(source)
-    return NamedSchedule(source)
-
-
-def read_saved_policy(source: str | Path) -> SavedPolicy:
-    """Read the card of a saved policy.
-
-    Raises:
-        FileNotFoundError: There is no such file, nor such a name.
-        ValueError: The file is not a saved policy.
-    """
-    file = read_policy(source)
-    saved = SavedPolicy(file.source, file.card)
-    try:
-        # The entries of the card that the properties rely on must be there.
-        _ = saved.recipe, saved.training_seed
-    except (KeyError, TypeError, ValueError) as problem:
-        raise ValueError(f"{file.source!r} is not a saved policy: {problem!r}") from problem
-    return saved
+        return NamedPolicy(source, read_policy(source).card)
+    return NamedPolicy(source)

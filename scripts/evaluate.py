@@ -27,7 +27,7 @@ from agents.figures import RoadMap, draw_bars, draw_errors, draw_maps, estimate_
 from agents.files import write_json
 from agents.page import watch, write_page
 from agents.play import Cell
-from agents.policies import NamedSchedule, find_policy, policy_name
+from agents.policies import find_policy, policy_name
 from agents.seeds import seed_kind
 from agents.statistics import Interval, mean_interval
 from agents.studies import suite
@@ -311,7 +311,7 @@ def verdicts(rows: pl.DataFrame, scores: Sequence[Score], cells: Sequence[Cell])
 def _kinds(scores: Sequence[Score], cells: Sequence[Cell]) -> tuple[list[Score], list[Score]]:
     """Return the scores of learned policies, and of rules that could be played in their place."""
     sources = {cell.labels["policy"]: cell.policy for cell in cells}
-    rules = {name for name, each in sources.items() if isinstance(find_policy(each), NamedSchedule)}
+    rules = {name for name, each in sources.items() if find_policy(each).is_schedule}
     return (
         [each for each in scores if each.policy not in rules],
         [each for each in scores if each.policy in rules - {ALL, *ORACLES}],

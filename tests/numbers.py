@@ -22,7 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.policies import read_saved_policy
+from agents.policies import find_policy
 from dptse_env import evaluate
 from dptse_env.estimators import Measurement, make_estimator
 from dptse_env.policies import TRANSFERABLE
@@ -189,7 +189,7 @@ def choices(policy: str) -> Numbers:
     """Return the queries of a schedule or a shipped policy over `SECONDS`, packed as bits."""
     make = functools.partial(_make, "PrivateHighway-v1", horizon=SECONDS)
     if policy in POLICIES:
-        saved = read_saved_policy(policy)
+        saved = find_policy(policy)
         env = make(**{"privacy": POLICIES[policy], **saved.keywords})
         player = saved.load(env, allow=TRANSFERABLE)
     else:

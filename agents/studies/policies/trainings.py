@@ -16,7 +16,6 @@ from agents.environments import make_config, quietly
 from agents.executors import run_shown
 from agents.files import write_json
 from agents.play import record
-from agents.policies import read_saved_policy
 from agents.studies.policies import (
     CURVES,
     LEARNERS,
@@ -34,6 +33,7 @@ from agents.training.run import BEST, CURVE, RULES_FILE
 from agents.training.run_files import PLAN, check_plan, keep_plan, read_progress
 from agents.training.settings import TrainingPlan, parse_algorithm
 from agents.training.training import require_trained, train
+from dptse_env.policies import read_policy
 from dptse_env.traffic import Records
 
 BEST_LEARNERS = 2
@@ -196,7 +196,7 @@ def keep_curves(study: Path) -> None:
                 "setting": setting,
                 "policy": learner,
                 "training_seed": training.seed,
-                "digest": read_saved_policy(training.folder(study) / BEST).identity,
+                "digest": read_policy(training.folder(study) / BEST).identity,
                 **{
                     name: row[name] + sum(last[name] for last in earlier)
                     for name in ("steps", "seconds")
