@@ -11,7 +11,6 @@ run beside them.
 
 from __future__ import annotations
 
-import importlib
 import platform
 import traceback
 from concurrent.futures import ProcessPoolExecutor
@@ -22,7 +21,7 @@ from typing import Literal, get_args
 
 from agents.tables import markdown
 from agents.terminal import make_table
-from benchmarks.turns import HEADER, Row, compare, make_batch, stepping, take_turns
+from benchmarks.turns import HEADER, Row, measure
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.threads import n_cores
 from dptse_env.versions import versions_with
@@ -47,16 +46,6 @@ class Args(Environments, Command):
     """Smallest sizes: whether it runs, not how fast it is."""
 
 
-def measure(part: str, args: Args) -> list[Row]:
-    """Return the rows of a part; here, so that a process of its own can be asked for them."""
-    if not args.env:
-        rows: list[Row] = importlib.import_module(f"benchmarks.{part}").measure(quick=args.quick)
-        return rows
-    n, n_steps, rounds = (2, 2, 2) if args.quick else (256, 20, 25)
-    work = {each: stepping(make_batch(each, n, traffic_seeds="0:16"), n_steps) for each in args.env}
-    return compare(take_turns(work, rounds), dict.fromkeys(args.env[1:], args.env[0]))
-
-
 def main(args: Args) -> None:
     """Measure, and print and write what there is after each part.
 
@@ -70,7 +59,7 @@ def main(args: Args) -> None:
     for part in ("environments",) if args.env else args.parts:
         try:
             with ProcessPoolExecutor(1, get_context("spawn")) as alone:
-                rows = alone.submit(measure, part, args).result()
+                rows = alone.submit(measure, part, args.env, args.quick).result()
         except Exception:
             traceback.print_exc()
             failed.append(part)

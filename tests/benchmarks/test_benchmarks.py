@@ -57,7 +57,7 @@ def test_a_ratio_is_a_geometric_mean_with_the_interval_of_the_logarithms():
 
 
 def test_a_part_that_fails_loses_nothing_of_the_others(tmp_path, monkeypatch, capsys):
-    def measure(part, args):
+    def measure(part, envs, quick):
         return [[f"a step of {part}", "1.0", "", "", ""]] if part != "environment" else {}[part]
 
     monkeypatch.setattr(benchmarks, "measure", measure)
