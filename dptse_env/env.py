@@ -146,7 +146,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `delta`              | 0.05            | short for `privacy`'s                               |
     | `incident`           | "preset"        | short for `corridor`'s; `random`, `none`, a mapping |
     | `demand`             | "preset"        | short for `corridor`'s; `random`, a mapping         |
-    | `render_mode`        | None            | or `rgb_array`, `human` (extra `video`)             |
+    | `render_mode`        | None            | or `rgb_array` (extra `plot`), `human` (`video`)    |
     | `render_every`       | 1               | seconds between two drawings                        |
     | `records`            | None            | folder of the record cache; None for the user's     |
 
@@ -202,8 +202,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
 
         Raises:
             ValueError: A key is unknown or a value out of range; the message names it.
-            MissingExtraError: ``render_mode`` is ``"human"`` and pygame is not installed, or
-                ``backend`` is ``"reference"`` and its filters are not.
+            MissingExtraError: A package is not installed: matplotlib for a ``render_mode``, pygame
+                for ``"human"``, the filters of ``backend="reference"``.
 
         Warns:
             UserWarning: A release model with a guarantee is configured, and other keywords void

@@ -217,7 +217,12 @@ class Drawing:
             episode: Its number.
             every: Seconds between two drawings; in between, `draw` returns the last one.
             screen: Shows every second; None for none.
+
+        Raises:
+            MissingExtraError: matplotlib is not installed.
         """
+        with needed_for("a render_mode"):
+            import matplotlib  # noqa: F401, PLC0415  (slow to import)
         self.episode, self.every, self.screen = episode, every, screen
         self.history: History | None = None
         self._picture: Picture | None = None

@@ -111,6 +111,8 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
 
         Raises:
             ValueError: A key is unknown or a value out of range; the message names it.
+            MissingExtraError: matplotlib is not installed for a ``render_mode``, or the filters of
+                ``backend="reference"`` are not.
 
         Warns:
             UserWarning: A release model with a guarantee is configured, and other keywords void

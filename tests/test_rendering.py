@@ -93,10 +93,15 @@ def test_a_window_shows_what_a_picture_would_until_it_is_closed(display):
     assert shown() is None
 
 
-def test_a_missing_pygame_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[video\]'"):
-        make()
+@pytest.mark.parametrize(
+    ("module", "mode", "extra"), [("matplotlib", "rgb_array", "plot"), ("pygame", "human", "video")]
+)
+def test_a_missing_package_names_the_extra_when_the_environment_is_made(
+    module, mode, extra, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtraError, match=rf"pip install 'dptse-env\[{extra}\]'"):
+        make(mode)
 
 
 def test_a_video_has_a_frame_for_each_second(tmp_path):

@@ -194,6 +194,7 @@ def load_plugins() -> None:
 
 
 EXTRAS: Mapping[str, tuple[str, ...]] = {
+    "plot": ("matplotlib",),
     "train": (
         "optuna", "plotly", "polars", "rich", "sb3_contrib", "stable_baselines3", "tomlkit",
         "torch", "tyro",
@@ -203,7 +204,8 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "ray": ("ray",),
     "video": ("moviepy", "pygame"),
 }  # fmt: skip
-"""Modules that each extra brings. `sumo` comes with eclipse-sumo."""
+"""Modules that each extra brings beside those of other extras; `train`, `corridors` and `video`
+bring `plot`, too. `sumo` comes with eclipse-sumo."""
 
 
 class MissingExtraError(ImportError):

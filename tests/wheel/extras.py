@@ -48,7 +48,7 @@ def main(with_train: bool) -> None:
         for package in ("agents", "scripts"):
             assert dict(lacks(package)) == {package: "train"}
     check_corridor()
-    check_window()
+    check_pictures(with_train)
     for extra, commands in (WITH_TRAIN if with_train else WITHOUT_EXTRAS).items():
         for words in commands:
             check_command(extra, words)
@@ -91,14 +91,20 @@ def check_corridor() -> None:
     assert extra_of(said) == "corridors"
 
 
-def check_window() -> None:
-    """Make an environment that shows itself in a window."""
-    said = ""
-    try:
-        gym.make("dptse_env:dptse/ShortHighway-v0", render_mode="human")
-    except MissingExtraError as problem:
-        said = str(problem)
-    assert extra_of(said) == "video"
+def check_pictures(with_train: bool) -> None:
+    """Make environments that show themselves in a window, and in pictures."""
+    wanted = {"human": "video"} if with_train else {"human": "video", "rgb_array": "plot"}
+    for mode, extra in wanted.items():
+        said = ""
+        try:
+            gym.make("dptse_env:dptse/ShortHighway-v0", render_mode=mode)
+        except MissingExtraError as problem:
+            said = str(problem)
+        assert extra_of(said) == extra
+    if with_train:
+        env = gym.make("dptse_env:dptse/ShortHighway-v0", render_mode="rgb_array")
+        env.reset(seed=0)
+        assert env.render().std() > 0
 
 
 def check_command(extra: str, words: list[str]) -> None:

@@ -13,18 +13,18 @@ def main() -> None:
     import dptse_env
 
     assert Path(sys.prefix) in Path(dptse_env.__file__).parents, dptse_env.__file__
-    assert importlib.util.find_spec("torch") is None, "the core must not need torch"
+    for extra in ("matplotlib", "torch"):
+        assert importlib.util.find_spec(extra) is None, f"the core must not need {extra}"
     heavy = {"libsumo", "numba", "torch", "matplotlib"} & set(sys.modules)
     assert not heavy, f"import dptse_env must not import {heavy}"
     for env_id in ("dptse/PaperHighway-v0", "dptse/ShortHighway-v0"):
-        env = gym.make(f"dptse_env:{env_id}", render_mode="rgb_array")
+        env = gym.make(f"dptse_env:{env_id}")
         env.reset(seed=0)
         env.action_space.seed(0)
         for _ in range(30):
             observation, reward, *_ = env.step(env.action_space.sample())
             assert np.isfinite(observation).all()
             assert np.isfinite(reward)
-        assert env.render().std() > 0
         env.close()
     for estimator in ("random_walk", "ukf", "enkf", "mhe"):
         env = gym.make(
