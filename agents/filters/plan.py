@@ -88,20 +88,16 @@ class FilterPlan:
         seed: Training seed: scenarios, first weights, order.
         traffic_seeds: Traffic seeds to train on.
         validation_seeds: Traffic seeds to validate on.
+        rounds: Rounds, one after the other.
         validation_envs: Environments to validate in, as ``ID`` or ``ID {JSON}``.
         validation_highways: Numbers (first, stop) of the highways to validate on, with a section of
             each.
         ranges: Ranges that scenarios are drawn from.
-        rounds: Rounds, one after the other.
         width: Width of the hidden state.
         windows: Windows of a section, or traffic seeds of another scenario.
         episodes: Episodes of a batch, which mixes scenarios on any roads.
         seconds: Length of an episode [s].
-        window: Seconds over which gradients are propagated.
         learning_rate: First learning rate of Adam; it falls along a cosine.
-        likelihood: Weight of the likelihood in the loss.
-        prediction: Weight of the loss of predictions.
-        clip_norm: Largest norm of a gradient.
         checkpoint_every: Passes between checkpoints.
         initial: Weights that the training begins with, a name or a file; None to draw them at
             random.
@@ -114,25 +110,17 @@ class FilterPlan:
 
     kind: Kind
     seed: Annotated[int, Interval(0, 2**31)]
-    traffic_seeds: tuple[int, ...] = tuple(TRAINING_SEEDS[:32])
-    validation_seeds: tuple[int, ...] = tuple(VALIDATION_SEEDS[:8])
+    traffic_seeds: tuple[int, ...]
+    validation_seeds: tuple[int, ...]
+    rounds: tuple[Round, ...]
     validation_envs: tuple[str, ...] = ()
     validation_highways: tuple[int, int] = (1000, 1012)
     ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
-    rounds: tuple[Round, ...] = (
-        Round("ekf", 96, 300),
-        Round(OWN, 96, 400),
-        Round(OWN, 96, 600),
-    )
     width: Annotated[int, Interval(1, 512)] = 64
     windows: Annotated[int, Interval(1, 24)] = 16
     episodes: Annotated[int, Interval(1, 10_000)] = 32
     seconds: Annotated[int, Interval(1, 600)] = 400
-    window: Annotated[int, Interval(1, 10_000)] = 50
     learning_rate: Annotated[float, Interval(0, 1, open_low=True)] = 4e-3
-    likelihood: Annotated[float, Interval(0, 1)] = 0.03
-    prediction: Annotated[float, Interval(0, 10)] = 0.3
-    clip_norm: Annotated[float, Interval(0, 1e6, open_low=True)] = 1.0
     checkpoint_every: Annotated[int, Interval(1, 1_000_000)] = 64
     initial: str | None = None
     teacher: Annotated[float, Interval(0, 1)] = 0.0

@@ -32,6 +32,12 @@ BOUNDARIES: dict[Kind, dict[str, float]] = {
     "speeds": {"true": 0.8, "nominal": 0.1, "private": 0.1},
 }
 """Sources of the boundary inputs, and how likely each is where it is not the usual one."""
+EPSILONS, CAPS = (0.5, 20.0), (24, 128)
+"""Ranges of epsilon, and of the cap of ``capped``; drawn log-uniformly."""
+DELTAS = (0.05, 0.001)
+"""Values of delta."""
+CLIPS, PACES = (18.0, 51.0), (0.7, 0.95)
+"""Ranges of the clip [km/h] and of the pace of ``paced``."""
 PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
 
 
@@ -115,11 +121,6 @@ class ScenarioRanges:
         sections: Share of the scenarios that are on sections of highways, not in one of `envs`.
         highways: Numbers (first, stop) of these highways.
         schedules: Query schedules.
-        epsilon: Range of epsilon, drawn log-uniformly.
-        deltas: Values of delta.
-        caps: Range of the cap of ``capped``, drawn log-uniformly.
-        clips: Range of the clip of ``paced`` [km/h].
-        paces: Range of the pace of ``paced``.
         spans: Spans of queries under ``paced``.
 
     Raises:
@@ -130,11 +131,6 @@ class ScenarioRanges:
     sections: Annotated[float, Interval(0, 1)] = 0.5
     highways: tuple[int, int] = (0, 80)
     schedules: tuple[str, ...] = SCHEDULES
-    epsilon: tuple[float, float] = (0.5, 20.0)
-    deltas: tuple[float, ...] = (0.05, 0.001)
-    caps: tuple[int, int] = (24, 128)
-    clips: tuple[float, float] = (18.0, 51.0)
-    paces: tuple[float, float] = (0.7, 0.95)
     spans: tuple[tuple[int, ...], ...] = ((1,), (2,), (1, 2))
 
     def __post_init__(self) -> None:
@@ -177,7 +173,7 @@ class ScenarioRanges:
             drawn = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
             seeds = tuple(int(seed) for seed in drawn)
             keywords |= {"horizon": seconds, "random_start": seconds < corridor.conditions.duration}
-        privacy = self._draw_privacy(rng, mechanism)
+        privacy = _draw_privacy(rng, mechanism)
         if section is not None or rng.random() < 0.3:
             chances = dict(BOUNDARIES[kind])
             if section and section.averaged:
@@ -221,17 +217,16 @@ class ScenarioRanges:
             seed=int(rng.integers(2**31)),
         )
 
-    def _draw_privacy(self, rng: np.random.Generator, mechanism: str) -> dict[str, Any]:
-        low, high = np.log(self.epsilon)
-        privacy: dict[str, Any] = {
-            "preset": mechanism,
-            "epsilon": round(float(np.exp(rng.uniform(low, high))), 3),
-            "delta": float(rng.choice(self.deltas)),
-        }
-        if mechanism == "capped":
-            low, high = np.log(self.caps)
-            privacy["cap"] = int(np.exp(rng.uniform(low, high)))
-        elif mechanism == "paced":
-            privacy["clip"] = round(float(rng.uniform(*self.clips)), 1)
-            privacy["pace"] = round(float(rng.uniform(*self.paces)), 3)
-        return privacy
+
+def _draw_privacy(rng: np.random.Generator, mechanism: str) -> dict[str, Any]:
+    privacy: dict[str, Any] = {
+        "preset": mechanism,
+        "epsilon": round(float(np.exp(rng.uniform(*np.log(EPSILONS)))), 3),
+        "delta": float(rng.choice(DELTAS)),
+    }
+    if mechanism == "capped":
+        privacy["cap"] = int(np.exp(rng.uniform(*np.log(CAPS))))
+    elif mechanism == "paced":
+        privacy["clip"] = round(float(rng.uniform(*CLIPS)), 1)
+        privacy["pace"] = round(float(rng.uniform(*PACES)), 3)
+    return privacy

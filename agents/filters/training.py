@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -18,13 +18,7 @@ from agents.filters.collecting import Batch, Episodes, collect, draw_batch
 from agents.filters.network import RecurrentNetwork, second_loss, teacher_loss
 from agents.filters.plan import OWN, FilterPlan, played_by
 from agents.play import play
-from agents.training.run_files import (
-    Row,
-    keep_plan,
-    read_checkpoint,
-    write_checkpoint,
-    write_progress,
-)
+from agents.training.run_files import Row, TrainingFolder, Watcher
 from dptse_env.estimators.recurrent import read_weights, write_weights
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE
 from dptse_env.importers.folder import ROAD, new_folder
@@ -35,16 +29,17 @@ WEIGHTS, PLAYED = "weights.safetensors", "played.safetensors"
 """The trained weights, and those that the scenarios of a round are collected with."""
 SECTIONS = "sections"
 """Folder of the sections to validate on."""
+WINDOW = 50
+"""Seconds over which gradients are propagated."""
+LIKELIHOOD, PREDICTION = 0.03, 0.3
+"""Weights in the loss of the likelihood, and of the predictions."""
+LARGEST_NORM = 1.0
+"""Norm to which longer gradients are clipped."""
 AVERAGING = 0.998
 """Decay of the moving average of weights in an update. Batches differ so much that the last weights
 are biased towards the last batches: densities were 4 to 11 veh/km too large."""
 SHOWN_EVERY = 10
 """Passes after which the learning curve is written."""
-COLUMNS = (
-    "update", "steps", "seconds", "round", "loss", "error", "rate", "validation", "sections",
-    "chi2",
-)  # fmt: skip
-Watcher = Callable[[Row], None]
 
 
 class State(NamedTuple):
@@ -74,8 +69,8 @@ def _advance(
     return State(hidden, predicted, age), *network.read(batch.roads, torch.stack(kept))
 
 
-class FilterTraining:
-    """A training in a folder: a network, its optimiser, learning curve and checkpoints.
+class FilterTraining(TrainingFolder):
+    """The training of a recurrent network.
 
     A training that was killed continues from its last checkpoint to the same numbers, on the same
     machine with the same number of torch's threads. Scenarios are not stored: they are collected
@@ -83,10 +78,8 @@ class FilterTraining:
 
     Attributes:
         plan: The plan.
-        folder: The folder.
         network: The network after the last update; its moving average is played and saved.
         done: Number of passes that are done.
-        rows: The learning curve so far.
     """
 
     def __init__(
@@ -98,24 +91,17 @@ class FilterTraining:
         watchers: Sequence[Watcher] = (),
         executor: Executor = this_process,
     ) -> None:
-        """Restore the state of the folder, if there is one.
+        """Take a folder, and what it has; see `TrainingFolder`.
 
         Args:
             plan: The plan.
             folder: The folder; made if it is missing.
             records: Library of records, or its folder; None for the user's cache.
-            watchers: Receive every row of the learning curve, those read from the folder first.
+            watchers: Receive every row of the learning curve, those of the checkpoint first.
             executor: Plays the scenarios.
-
-        Raises:
-            ValueError: The folder belongs to another plan, or its checkpoint is damaged.
-            OSError: The folder cannot be written.
         """
-        self.plan, self.folder, self._records = plan, folder, records
-        self._executor = executor
-        self._watchers = watchers
-        checkpoint = read_checkpoint(folder)
-        keep_plan(folder, plan.settings())
+        super().__init__(folder, plan.settings(), watchers)
+        self.plan, self._records, self._executor = plan, records, executor
         torch.manual_seed(plan.seed)
         self.network = RecurrentNetwork(plan.width)
         if plan.initial is not None:
@@ -124,15 +110,12 @@ class FilterTraining:
         self._average = copy.deepcopy(self.network)
         self._teacher = copy.deepcopy(self.network) if plan.teacher > 0.0 else None
         self.done, self._seconds = 0, 0.0
-        self.rows: list[Row] = []
-        if checkpoint is not None:
-            self.network.load_state_dict(checkpoint["network"])
-            self._optimiser.load_state_dict(checkpoint["optimiser"])
-            self._average.load_state_dict(checkpoint["average"])
-            self.done, self._seconds = checkpoint["done"], checkpoint["seconds"]
-            self.rows = checkpoint["rows"]
-            for row in self.rows:
-                self._watch(row)
+        if self.checkpoint is not None:
+            self.network.load_state_dict(self.checkpoint["network"])
+            self._optimiser.load_state_dict(self.checkpoint["optimiser"])
+            self._average.load_state_dict(self.checkpoint["average"])
+            self.done, self._seconds = self.checkpoint["done"], self.checkpoint["seconds"]
+        self.restore()
 
     def run(self) -> None:
         """Train to the end of the plan, and save the weights beside the checkpoint."""
@@ -145,7 +128,7 @@ class FilterTraining:
             while self.done < last:
                 self._pass(index, collected)
         self._save(WEIGHTS)
-        write_progress(self.folder, self.rows, COLUMNS)
+        self.write_curve()
 
     def _collect(self, index: int) -> list[Episodes]:
         name = self.plan.rounds[index].estimator
@@ -164,8 +147,8 @@ class FilterTraining:
         taught = batch.ordinary if self._teacher is not None else None
         states = [_begin(each, plan.width) for each in (batch, taught) if each is not None]
         losses, errors = [], []
-        for first in range(0, plan.seconds, plan.window):
-            window = range(first, min(first + plan.window, plan.seconds))
+        for first in range(0, plan.seconds, WINDOW):
+            window = range(first, min(first + WINDOW, plan.seconds))
             loss, error = self._window(batch, taught, window, states)
             losses.append(loss)
             errors.append(error)
@@ -179,12 +162,17 @@ class FilterTraining:
         is_due = self.done % plan.checkpoint_every == 0 or self.done == plan.n_passes
         if is_due:
             row |= self._validate()
-        self.rows.append(row)
-        self._watch(row)
+        self.append(row)
         if is_due:
-            self._keep()
+            self.keep(
+                network=self.network.state_dict(),
+                optimiser=self._optimiser.state_dict(),
+                average=self._average.state_dict(),
+                done=self.done,
+                seconds=self._seconds,
+            )
         elif self.done % SHOWN_EVERY == 0 and self.done > plan.checkpoint_every:
-            write_progress(self.folder, self.rows, COLUMNS)
+            self.write_curve()
 
     def _window(
         self, batch: Batch, taught: Batch | None, window: range, states: list[State]
@@ -194,24 +182,24 @@ class FilterTraining:
         states[0], present, ahead = _advance(network, batch, window, states[0])
         truth, after = (batch.truth[window.start + k : window.stop + k] for k in (0, 1))
         weight = 1.0 - plan.teacher * roads.ordinary if taught is not None else None
-        loss = second_loss(roads, present, truth, plan.likelihood, weight)
+        loss = second_loss(roads, present, truth, LIKELIHOOD, weight)
         error = float(second_loss(roads, present.detach(), truth, 0.0))
         if len(after) > 0:
-            of_next = second_loss(roads, ahead[: len(after)], after, plan.likelihood, weight)
-            loss = loss + plan.prediction * of_next
+            of_next = second_loss(roads, ahead[: len(after)], after, LIKELIHOOD, weight)
+            loss = loss + PREDICTION * of_next
         if taught is not None and self._teacher is not None:
             with torch.no_grad():
                 states[1], *said = _advance(self._teacher, taught, window, states[1])
             n = len(taught.start)  # ordinary scenarios come first
             for own, of_teacher, factor in zip(
-                (present, ahead), said, (1.0, plan.prediction), strict=True
+                (present, ahead), said, (1.0, PREDICTION), strict=True
             ):
                 lesson = teacher_loss(taught.roads, own[:, :n], of_teacher)
                 share = taught.roads.n_episodes / roads.n_episodes
                 loss = loss + plan.teacher * share * factor * lesson
         self._optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(network.parameters(), plan.clip_norm)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), LARGEST_NORM)
         self._optimiser.step()
         with torch.no_grad():
             for mean, last in zip(self._average.parameters(), network.parameters(), strict=True):
@@ -245,19 +233,3 @@ class FilterTraining:
     def _save(self, name: str) -> None:
         card = self.plan.card(self.done, self.folder.name)
         write_weights(self.folder / name, self._average.weights(), card)
-
-    def _keep(self) -> None:
-        content = {
-            "rows": self.rows,
-            "network": self.network.state_dict(),
-            "optimiser": self._optimiser.state_dict(),
-            "average": self._average.state_dict(),
-            "done": self.done,
-            "seconds": self._seconds,
-        }
-        write_checkpoint(self.folder, content)
-        write_progress(self.folder, self.rows, COLUMNS)
-
-    def _watch(self, row: Row) -> None:
-        for watcher in self._watchers:
-            watcher(row)

@@ -21,13 +21,7 @@ from agents.figures import COLOURS, draw_rule, finish_figure, make_figure, save_
 from agents.files import write_json
 from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
-from agents.training.run_files import (
-    Row,
-    keep_plan,
-    read_checkpoint,
-    write_checkpoint,
-    write_progress,
-)
+from agents.training.run_files import Row, TrainingFolder, Watcher
 from agents.training.settings import TrainingPlan
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import ActingPolicy, save_policy
@@ -45,9 +39,6 @@ RULES = (
 )  # fmt: skip
 """Rules whose errors on validation traffic a training is shown beside."""
 
-Watcher = Callable[[Row], None]
-"""Receives every row of the learning curve as it comes."""
-
 Progress = Callable[[float, str], None]
 """Called with the fraction of a training that is done, and the name of its stage, if it has any."""
 
@@ -56,13 +47,11 @@ def silent(fraction: float, stage: str) -> None:
     """Show no progress."""
 
 
-class Run:
-    """A training in its folder. A checkpoint has the curve up to it, so that the two agree.
+class Run(TrainingFolder):
+    """The training of a policy.
 
     Attributes:
         plan: The plan.
-        rows: The learning curve so far.
-        checkpoint: What `keep` was given last, by an earlier process; None where there was none.
         keywords: Further keywords of all environments that are trained in.
         progress: Told of stages.
         rules: Errors of rules on validation traffic, by name.
@@ -76,26 +65,16 @@ class Run:
         watchers: Sequence[Watcher],
         progress: Progress,
     ) -> None:
-        """Take the folder, read what it has, and play the rules; arguments are those of `train`.
-
-        Raises:
-            ValueError: The folder belongs to another plan, or its checkpoint is damaged.
-            OSError: The folder cannot be written.
-        """
-        content = plan.content()
-        self.checkpoint = read_checkpoint(folder)  # may refuse it; nothing is written then
-        keep_plan(folder, content)
+        """Take a folder, and play the rules; see `TrainingFolder` and `train`."""
+        super().__init__(folder, plan.content(), watchers)
         self.plan, self.progress = plan, progress
         self.keywords: dict[str, Any] = {
             "records": records,
             "action": plan.algorithm.action,
             "traffic_seeds": list(plan.traffic_seeds),
         }
-        self._folder, self._watchers = folder, watchers
         self.rules = keep_rules(plan, folder, records, progress)
-        self.rows: list[Row] = []
-        for row in self.checkpoint["rows"] if self.checkpoint else ():
-            self._append(row)
+        self.restore()
         self._best = min(map(least, self.rows), default=np.inf)
         # The clock of the training starts when the rules have been played. It is that of the
         # processor, so that what else runs on a machine takes nothing from a training.
@@ -122,7 +101,7 @@ class Run:
         """
         seconds = round(time.process_time() - self._begun, 1)
         row = {"update": len(self.rows), "steps": steps, "seconds": seconds, **values}
-        self._append(row)
+        self.append(row)
         if self._board is not None:
             self._board.write(row, dict.fromkeys(row, ()), steps)
 
@@ -156,20 +135,11 @@ class Run:
             self._save(BEST, policies[0], row, scaled)
         return row
 
-    def keep(self, **content: Any) -> None:
-        """Write a checkpoint of tensors, numbers and strings, and the curve.
-
-        Raises:
-            OSError: The disk is full or cannot be written; the last checkpoint stays.
-        """
-        write_checkpoint(self._folder, {"rows": self.rows, **content})
-        write_progress(self._folder, self.rows)
-
     def finish(self) -> None:
         """Write the curve, and draw it with the rules as lines."""
-        write_progress(self._folder, self.rows)
+        self.write_curve()
         title = f"{self.plan.algorithm.name} in {self.plan.worlds[0]}, validation traffic"
-        save_figure(draw_curve(self.rows, self.rules), self._folder / CURVE, title)
+        save_figure(draw_curve(self.rows, self.rules), self.folder / CURVE, title)
 
     def _save(self, name: str, policy: BasePolicy, row: Row, scaled: VecNormalize | None) -> None:
         """Write a policy with the seconds of traffic and the errors of its row of the curve.
@@ -178,7 +148,7 @@ class Run:
         """
         plan, world = self.plan, self.plan.worlds[0]
         save_policy(
-            self._folder / name,
+            self.folder / name,
             policy,
             world.config,
             env=world.env,
@@ -196,16 +166,11 @@ class Run:
             deterministic=row["validation"] <= row["validation_drawn"],
         )
 
-    def _append(self, row: Row) -> None:
-        self.rows.append(row)
-        for watcher in self._watchers:
-            watcher(row)
-
     @cached_property
     def _board(self) -> TensorBoardOutputFormat | None:
         if importlib.util.find_spec("tensorboard") is None:
             return None
-        return TensorBoardOutputFormat(str(self._folder / TENSORBOARD))
+        return TensorBoardOutputFormat(str(self.folder / TENSORBOARD))
 
     @cached_property
     def _environments(self) -> list[SensorQueryVectorEnv]:

@@ -1,11 +1,11 @@
-"""Files that a training leaves on disk: plan, checkpoint and learning curve, each atomically."""
+"""The folder of a training: its plan, and a checkpoint and a learning curve that agree."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,67 @@ FORMAT = 5
 """Format of the files; raise it whenever their content changes its meaning."""
 
 Row = dict[str, float]
+
+Watcher = Callable[[Row], None]
+"""Receives every row of the learning curve as it comes."""
+
+
+class TrainingFolder:
+    """A training in its folder. A checkpoint has the curve up to it, so that the two agree.
+
+    Attributes:
+        folder: The folder.
+        checkpoint: What `keep` was given last, by an earlier process; None where there was none.
+        rows: The learning curve so far; empty until `restore`.
+    """
+
+    def __init__(self, folder: Path, plan: Mapping[str, Any], watchers: Sequence[Watcher]) -> None:
+        """Take a folder, which is made if it is missing.
+
+        Args:
+            folder: The folder.
+            plan: What the numbers of the training depend on, as plain JSON.
+            watchers: Receive every row of the curve, those of the checkpoint first.
+
+        Raises:
+            ValueError: The folder belongs to another plan, or its checkpoint is damaged.
+            OSError: The folder cannot be written.
+        """
+        self.checkpoint = read_checkpoint(folder)  # may refuse it; nothing is written then
+        keep_plan(folder, plan)
+        self.folder, self._watchers = folder, watchers
+        self.rows: list[Row] = []
+
+    def restore(self) -> None:
+        """Take the rows of the checkpoint."""
+        for row in self.checkpoint["rows"] if self.checkpoint else ():
+            self.append(row)
+
+    def append(self, row: Row) -> None:
+        """Add a row to the curve, and show it to the watchers."""
+        self.rows.append(row)
+        for watcher in self._watchers:
+            watcher(row)
+
+    def keep(self, **content: Any) -> None:
+        """Write a checkpoint of tensors, numbers and strings, and the curve.
+
+        Raises:
+            OSError: The disk is full or cannot be written; the last checkpoint stays.
+        """
+        buffer = io.BytesIO()
+        torch.save({"rows": self.rows, **content}, buffer)
+        write_atomically(self.folder / CHECKPOINT, buffer.getvalue())
+        self.write_curve()
+
+    def write_curve(self) -> None:
+        """Write the learning curve; values that a row lacks stay empty."""
+        columns = list(dict.fromkeys(name for row in self.rows for name in row))
+        text = io.StringIO()
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_atomically(self.folder / PROGRESS, text.getvalue())
 
 
 def keep_plan(folder: Path, plan: Mapping[str, Any]) -> None:
@@ -56,16 +117,6 @@ def check_plan(folder: Path, plan: Mapping[str, Any]) -> None:
         )
 
 
-def write_progress(folder: Path, rows: Sequence[Row], columns: Sequence[str] = ()) -> None:
-    """Write the learning curve; missing values stay empty. Columns are those of rows by default."""
-    columns = columns or list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(folder / PROGRESS, text.getvalue())
-
-
 def read_progress(folder: Path) -> list[Row]:
     """Return the learning curve; rows lack the values that are missing in the file.
 
@@ -85,13 +136,6 @@ def read_progress(folder: Path) -> list[Row]:
     if not rows or any("update" not in row for row in rows):
         raise ValueError(f"{path} is damaged: rows are missing; remove the folder to start over")
     return rows
-
-
-def write_checkpoint(folder: Path, content: dict[str, Any]) -> None:
-    """Write a checkpoint of tensors, numbers and strings."""
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    write_atomically(folder / CHECKPOINT, buffer.getvalue())
 
 
 def read_checkpoint(folder: Path) -> dict[str, Any] | None:

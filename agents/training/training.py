@@ -16,8 +16,8 @@ from agents.play import record
 from agents.seeds import training_seed
 from agents.training.learning import learn
 from agents.training.regression import Practice, regress
-from agents.training.run import POLICY, RULES_FILE, Progress, Run, Watcher, keep_rules, silent
-from agents.training.run_files import Row, check_plan, keep_plan, read_checkpoint
+from agents.training.run import POLICY, RULES_FILE, Progress, Run, keep_rules, silent
+from agents.training.run_files import Row, Watcher, check_plan, keep_plan, read_checkpoint
 from agents.training.settings import PlackettLuceSettings, TrainingPlan
 from agents.training.swaps import raise_scores, try_swaps
 from dptse_env.sb3 import RoadPolicy, SB3VecEnv

@@ -114,7 +114,7 @@ def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
 @pytest.mark.parametrize("algorithm", ["plackett-luce", "ppo"])
 def test_a_killed_program_goes_on(tmp_path, how, algorithm):
     def start(output, n_checkpoints):
-        where = "agents.training.run", "write_checkpoint", n_checkpoints
+        where = "agents.training.run_files:TrainingFolder", "keep", n_checkpoints
         given = words(tmp_path / output, algorithm)
         return run_killed(*where, "scripts.dptse", "train", *given, how=how)
 
