@@ -5,6 +5,6 @@ A release model of one's own is audited as any other, where it adds its noise by
 
     config = make_config("dptse_env:dptse/ShortHighway-v0", {"privacy": {"preset": MyRelease}})
     record = RecordLibrary().get(config.corridor, 0)
-    audit_environment(config, record, n_runs=5000).print()
-    audit_one_run(config, record).print()
+    print(audit_environment(config, record, trials=5000).verdict)
+    print(audit_one_run(config, record).verdict)
 """

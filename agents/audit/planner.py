@@ -8,17 +8,16 @@ from itertools import pairwise
 import numpy as np
 
 from agents.audit.attack import attack, overheard
-from agents.audit.worlds import AdjacentWorlds, Trajectory
+from agents.audit.worlds import Pair, Trajectory, Worlds
 from dptse_env.config import EnvConfig
 from dptse_env.parts import make_interface, make_release
-from dptse_env.release import Queries
 from dptse_env.release.vehicles import Terms
 from dptse_env.schedules import SCHEDULES
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.validation import require
 
-KINDS = ("worst-case", "opposite", "replaced", "deleted")
+KINDS = ("worst-case", "replaced", "deleted")
 """Kinds of targets; see `Planner.choose`."""
 
 PUBLIC_SCHEDULES = ("shift-ahead", "static", "round-robin")
@@ -34,7 +33,6 @@ list grows sparser down the ranking instead of ending early."""
 REHEARSALS = 4
 """Runs in either world by which pairs are compared: under `paced` noise moves prices."""
 
-Pair = tuple[Trajectory, Trajectory]
 Second = tuple[float, int, int, int]  # a cost, a step, a segment and the world it is queried for
 
 
@@ -46,20 +44,6 @@ def public_plan(config: EnvConfig, name: str) -> BoolArray:
     schedule = SCHEDULES.find(name)(interface)
     queried: BoolArray = schedule.select(steps, np.zeros((len(steps), size), dtype=np.float32))
     return queried
-
-
-def random_plan(
-    queries: Queries, n: int, generator: np.random.Generator, first: BoolArray | None = None
-) -> BoolArray:
-    """Return as many random queries as can be paid for n times, some of them first, (n, G)."""
-    order = generator.random((n, queries.n_queries))
-    if first is not None:
-        order -= first
-    ranked = np.argsort(order, axis=1)
-    paid = np.cumsum(queries.cost[ranked], axis=1) <= queries.bandwidth
-    plan = np.zeros(order.shape, dtype=bool)
-    np.put_along_axis(plan, ranked, paid, axis=1)
-    return plan
 
 
 class Planner:
@@ -80,7 +64,7 @@ class Planner:
         Raises:
             ValueError: There is no such policy.
         """
-        require(policy in POLICIES, "policy", f"one of {list(POLICIES)}", policy)
+        require(policy in POLICIES, "policies", f"one of {list(POLICIES)}", policy)
         self.config, self.policy = config, policy
         self.replaces = getattr(config.privacy, "adjacency", "replace") == "replace"
         self.is_event = getattr(config.privacy, "unit", "trip") == "event"
@@ -112,29 +96,37 @@ class Planner:
     def kinds(self) -> tuple[str, ...]:
         """Those of `KINDS` that go with the adjacency and the groups of channels."""
         kinds = KINDS if self._is_whole else ("worst-case",)
-        alone = () if self.replaces else ("opposite", "replaced")
-        return tuple(kind for kind in kinds if kind not in alone)
+        return tuple(kind for kind in kinds if self.replaces or kind != "replaced")
 
-    def choose(self, record: Record, kind: str) -> AdjacentWorlds:
+    def require_kind(self, kind: str) -> None:
+        """Refuse a target that is none of `kinds`.
+
+        Raises:
+            ValueError: See above.
+        """
+        require(kind in self.kinds, "target", f"one of {list(self.kinds)} here", kind)
+
+    def choose(self, record: Record, kind: str) -> Worlds:
         """Return the two worlds of a kind that the policy distinguishes best.
 
         Args:
             record: The traffic.
             kind: ``deleted``, a vehicle of the record is there or not; ``replaced``, one of two
                 vehicles of the record is there; ``worst-case``, a vehicle is added that stands
-                still, and in the other world stands elsewhere, drives by or is absent, whichever is
-                worst under the adjacency; ``opposite``, the part of it with two added vehicles on
-                one segment, as slow and as fast as can be.
+                still, and in the other world stands elsewhere, drives by as fast as can be or is
+                absent, whichever is worst under the adjacency.
 
         Raises:
             ValueError: It is none of `kinds`, or the record holds too few vehicles.
         """
-        require(kind in self.kinds, "target", f"one of {list(self.kinds)} here", kind)
-        is_made_up = kind in ("worst-case", "opposite")
-        worlds = self._made_up(record, kind) if is_made_up else self._of_record(record, kind)
+        self.require_kind(kind)
+        if kind == "worst-case":
+            worlds = self._made_up(record)
+        else:
+            worlds = self._of_record(record, alone=kind == "deleted")
         return max(worlds, key=self._reached) if len(worlds) > 1 else worlds[0]
 
-    def _made_up(self, record: Record, kind: str) -> list[AdjacentWorlds]:
+    def _made_up(self, record: Record) -> list[Worlds]:
         """Return worlds that differ in made-up vehicles."""
         here, *others = self._places(record)
         there = next(each for each in others if self._query[each] != self._query[here])
@@ -143,18 +135,16 @@ class Planner:
         if not self.replaces:
             pair = stands, Trajectory.absent()
             return [self._worlds(record, pair, f"{added}, or none in its place")]
-        found = []
-        if kind != "opposite":
-            pair = stands, Trajectory.constant(self._seconds, there, 0.0)
-            found.append(self._worlds(record, pair, f"{added}, or on segment {there} instead"))
+        pair = stands, Trajectory.constant(self._seconds, there, 0.0)
+        found = [self._worlds(record, pair, f"{added}, or on segment {there} instead")]
         if self._is_whole:
             name = "an added vehicle that stands, or one in its place at the speed limit"
             found.append(self._worlds(record, self._opposite(record), name))
         return found
 
-    def _of_record(self, record: Record, kind: str) -> list[AdjacentWorlds]:
+    def _of_record(self, record: Record, *, alone: bool) -> list[Worlds]:
         """Return worlds in which the best vehicle is replaced by others, or by none."""
-        ranked, alone = self.rank(record), kind == "deleted"
+        ranked = self.rank(record)
         need, n = 1 if alone else 2, len(ranked)
         require(n >= need, "traffic", f"a record of {need} observable vehicles", n)
         first = int(ranked[0])
@@ -236,7 +226,7 @@ class Planner:
         slow, fast = (Trajectory(seconds, segments, still + speed) for speed in (0.0, limit))
         return slow, fast
 
-    def _worlds(self, rest: Record, pair: Pair, description: str) -> AdjacentWorlds:
+    def _worlds(self, rest: Record, pair: Pair, description: str) -> Worlds:
         """Return two worlds that differ as far as is protected.
 
         For the unit ``event`` that is the second of the two trajectories that tells most.
@@ -247,16 +237,16 @@ class Planner:
                 np.add.at(total, vehicle.step, np.sum(self.moves(rest, vehicle) ** 2, axis=1))
             best = int(np.argmax(total))
             pair = pair[0].only(pair[0].step == best), pair[1].only(pair[1].step == best)
-        return AdjacentWorlds(rest, pair, description)
+        return Worlds.adjacent(rest, pair, description)
 
-    def _reached(self, worlds: AdjacentWorlds) -> float:
+    def _reached(self, worlds: Worlds) -> float:
         """Return the mean distance that the policy reaches between two worlds in some runs."""
         runs = attack(self.config, worlds, self.plan(worlds), REHEARSALS, progress=False)
         return float(runs.distances.mean())
 
     # Queries ------------------------------------------------------------------------------------
 
-    def plan(self, worlds: AdjacentWorlds) -> BoolArray:
+    def plan(self, worlds: Worlds) -> BoolArray:
         """Return the policy's queries, shape (horizon, G).
 
         A hunter follows the vehicle in both worlds, and queries it in the seconds that tell most,
@@ -294,12 +284,12 @@ class Planner:
                 queried[more[cost[queried].sum() + np.cumsum(cost[more]) <= bandwidth]] = True
         return plan
 
-    def _worthwhile(self, worlds: AdjacentWorlds, world: int) -> tuple[list[Second], int]:
+    def _worthwhile(self, worlds: Worlds, world: int) -> tuple[list[Second], int]:
         """Return the seconds in which to query a world's vehicle, and how many of them suffice.
 
         Those of the least cost are taken first.
         """
-        vehicle = worlds.trajectories[world]
+        vehicle = worlds.pair[world]
         seen = self._observable(worlds.rest)[vehicle.step, vehicle.segment]
         always = np.isin(vehicle.segment, self._always)
         if self._release.has_prices or not self._is_whole:
@@ -316,9 +306,9 @@ class Planner:
         columns = costs.tolist(), (chosen.step - 1).tolist(), chosen.segment.tolist()
         return [(*second, world) for second in zip(*columns, strict=True)], n_queries
 
-    def _squares_in(self, worlds: AdjacentWorlds, world: int) -> FloatArray:
+    def _squares_in(self, worlds: Worlds, world: int) -> FloatArray:
         """Return what each second of a trajectory tells, (m,); half of it where both meet."""
-        vehicle, other = worlds.trajectories[world], worlds.trajectories[1 - world]
+        vehicle, other = worlds.pair[world], worlds.pair[1 - world]
         moves, against = (self.moves(worlds.rest, each) for each in (vehicle, other))
         squares: FloatArray = np.sum(moves**2, axis=1)
         _, here, there = np.intersect1d(
@@ -397,7 +387,7 @@ def public_terms(
         release of each place, in units of the noise, shape (T, places, 2); and the centres of
         speeds [km/h], shape (T, places), NaN where mean speeds are released.
     """
-    alike = AdjacentWorlds(record, (Trajectory.absent(), Trajectory.absent()))
+    alike = Worlds.adjacent(record, (Trajectory.absent(), Trajectory.absent()))
     played = overheard(config, alike, np.zeros(1, int), plan, [np.random.default_rng(seed)])
     rows = []
     for release in played:

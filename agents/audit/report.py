@@ -5,37 +5,42 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
+
+from rich.table import Table
 
 from agents.audit.attack import attack
 from agents.audit.one_run import KINDS, attack_in_one_run
 from agents.audit.planner import Planner
 from agents.audit.residuals import NoiseTest, examine, residuals_of
-from agents.audit.search import CLIMBED, climb
-from agents.audit.statistics import (
-    AuditResult,
-    Claim,
-    audit,
-    audit_coins,
-    detectable_mu,
-    rejection_probability,
-)
+from agents.audit.statistics import AuditResult, Claim, audit, audit_coins
 from agents.executors import Executor, this_process
-from agents.files import write_json
-from agents.terminal import make_table, print_table, print_text
+from agents.terminal import make_table
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
-from dptse_env.privacy import epsilon_of, mu_of, rounded_up
+from dptse_env.privacy import mu_of, rounded_up
 from dptse_env.release import PrivacyReport
 from dptse_env.traffic import Record
-from dptse_env.utils.validation import require
-from dptse_env.versions import versions_with
 
-VIOLATION = math.sqrt(2.0)
-"""Ratio of a true mu to the claimed one for which power is reported: noise divided by 1.41."""
+
+class Attack(NamedTuple):
+    """An attack that was made.
+
+    Attributes:
+        target: The difference of the two worlds, or of all canaries, in words.
+        policy: The queries.
+        distance: Largest distance between the worlds' true sums, in units of the noise: the
+            largest mu that this attack can show. For one run, the distance at which equal canaries
+            would expect as many errors.
+        result: The statistical test.
+    """
+
+    target: str
+    policy: str
+    distance: float
+    result: AuditResult
 
 
 @dataclass(frozen=True)
@@ -43,55 +48,30 @@ class Finding:
     """The finding of one audit.
 
     Attributes:
-        target: The difference of the two worlds, or of all canaries, in words.
-        distance: Largest distance between the worlds' true sums, in units of the noise: the
-            largest mu that this attack can show. For one run, the distance at which equal canaries
-            would expect as many errors.
+        attack: The attack and what it says.
         noise: The test of the noise of some other episodes.
+        noise_factor: What the real noise was multiplied by.
+        privacy: What the release model states.
+        seconds: The time that it took.
     """
 
-    title: str
-    target: str
-    policy: str
-    noise_factor: float
-    distance: float
-    result: AuditResult
+    attack: Attack
     noise: NoiseTest
+    noise_factor: float
     privacy: PrivacyReport
     seconds: float
 
     @property
     def verdict(self) -> Literal["rejected", "not rejected"]:
         """``rejected`` if a bound lies above the claim, or the noise is not as stated."""
-        return "rejected" if self.noise.is_rejected else self.result.verdict
+        return "rejected" if self.noise.is_rejected else self.attack.result.verdict
 
-    @property
-    def gaussian_epsilon(self) -> float:
-        """The epsilon, at the claim's delta, of a Gaussian release with the bound on mu."""
-        mu = self.result.mu.value
-        return epsilon_of(mu, self.result.claim.delta) if mu > 0.0 else 0.0
-
-    @property
-    def power(self) -> float:
-        """Probability of rejecting a mechanism with a mu of `VIOLATION` times the claim."""
-        result, mu = self.result, self.result.claim.mu
-        return rejection_probability(
-            VIOLATION * mu, mu, result.n, result.confidence, is_one_run=result.is_one_run
-        )
-
-    @property
-    def detectable(self) -> float:
-        """Least mu for which a claim is rejected with probability 95 %, or infinity."""
-        result = self.result
-        return detectable_mu(
-            result.claim.mu, result.n, result.confidence, is_one_run=result.is_one_run
-        )
-
-    def print(self) -> None:
-        """Print the bounds and what they rest on; the verdict is the last line."""
+    def report(self, title: str) -> list[str | Table]:
+        """Return the bounds and what they rest on; the verdict is the last line."""
         columns = "claimed", "lower\nbound", "threshold", "false +", "false -"
-        table = make_table(self.title, "", *columns)
-        result, claim = self.result, self.result.claim
+        table = make_table(title, "", *columns)
+        target, policy, distance, result = self.attack
+        claim = result.claim
         rows = [("mu", claim.mu, result.mu)]
         if result.epsilon is not None:
             rows.append((f"epsilon at delta {claim.delta:g}", claim.epsilon, result.epsilon))
@@ -99,55 +79,47 @@ class Finding:
             rates = f"<= {bound.false_positives:.4f}", f"<= {bound.false_negatives:.4f}"
             row = rounded_up(claimed, ".3f"), f"{bound.value:.3f}", f"{bound.threshold:.2f}", *rates
             table.add_row(name, *row)
-        print_table(table)
         trials = f"at most, in {result.n} runs per world"
         if result.is_one_run:
             trials = f"by the expected errors at {result.n} canaries of one run"
-        print_text(
-            f"worlds: {self.target}; queries: {self.policy}; noise x {self.noise_factor:g}\n"
-            f"distance: {self.distance:.3f} standard deviations {trials} ({self.seconds:.0f} s), "
-            f"{self.distance / claim.mu:.4f} times the claim\n"
-            f"lower bound on mu, as epsilon at delta {claim.delta:g}: {self.gaussian_epsilon:.3f}\n"
-            f"power, the probability of rejecting a mu of {VIOLATION:.2f} times the claim: "
-            f"{self.power:.4f}"
+        factor = self.noise_factor * distance / result.detectable
+        sensitivity = (
+            f"sensitivity: it rejects a mu of {result.detectable:.3f} with probability 95 %; this "
+            f"target has it if the noise is {factor:.3f} times the declared one"
         )
-        if math.isfinite(self.detectable):
-            factor = self.noise_factor * self.distance / self.detectable
-            print_text(
-                f"sensitivity: it rejects a mu of {self.detectable:.3f} with probability 95 %; "
-                f"this target has it if the noise is {factor:.3f} times the declared one"
-            )
-        else:
+        if math.isinf(result.detectable):
             few = "canaries" if result.is_one_run else "runs"
-            print_text(f"too few {few} to reject this claim, however much leaks")
-        print_text(
+            sensitivity = f"too few {few} to reject this claim, however much leaks"
+        lines = [
+            f"worlds: {target}; queries: {policy}; noise x {self.noise_factor:g}",
+            f"distance: {distance:.3f} standard deviations {trials} ({self.seconds:.0f} s), "
+            f"{distance / claim.mu:.4f} times the claim",
+            sensitivity,
             f"noise: {'rejected' if self.noise.is_rejected else 'not rejected'} by "
             f"{self.noise.n} residuals of other episodes, p = {self.noise.p_value:.2g}; "
-            f"most suspect: {self.noise.suspect}"
-        )
+            f"most suspect: {self.noise.suspect}",
+        ]
         if "boundary_inputs" in self.privacy.void_reasons:
-            print_text(
+            lines.append(
                 'only the releases were attacked: boundary_inputs is "true", so the estimates use '
                 "the true traffic at the boundary, and their epsilon is infinite"
             )
-        print_text(f"verdict: {self.verdict}, at confidence {result.confidence:.0%}")
+        verdict = f"verdict: {self.verdict}, at confidence {result.confidence:.0%}"
+        return [table, *lines, verdict]
 
-    def write(self, path: Path, arguments: Mapping[str, Any]) -> None:
-        """Write the finding to a JSON file, with its origin."""
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        content = fields | {
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as plain JSON."""
+        least = self.attack.result.detectable
+        return {
             "verdict": self.verdict,
+            **self.attack._asdict(),
+            "result": dataclasses.asdict(self.attack.result),
+            "detectable_mu": least if math.isfinite(least) else None,
             "noise": dataclasses.asdict(self.noise),
-            "result": dataclasses.asdict(self.result),
-            "gaussian_epsilon": self.gaussian_epsilon,
-            "power": self.power,
-            "detectable_mu": self.detectable if math.isfinite(self.detectable) else None,
+            "noise_factor": self.noise_factor,
             "privacy": self.privacy.to_dict(),
-            "arguments": {key: str(value) for key, value in arguments.items()},
-            "versions": versions_with("numpy", "scipy"),
+            "seconds": self.seconds,
         }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, content)
 
 
 def audit_environment(
@@ -156,8 +128,7 @@ def audit_environment(
     target: str = "worst-case",
     policy: str = "hunter",
     *,
-    n_runs: int = 5000,
-    rounds: int = 100,
+    trials: int = 5000,
     noise_factor: float = 1.0,
     confidence: float = 0.95,
     seed: int = 0,
@@ -168,12 +139,9 @@ def audit_environment(
     Args:
         config: The configuration under attack, of `agents.environments.make_config`.
         record: The traffic, whose vehicles are known.
-        target: Kind of the vehicle that differs, in `agents.audit.planner.KINDS`, or ``climbed``,
-            the worst one that a search from random trips and queries finds.
-        policy: Queries, in `agents.audit.planner.POLICIES`; what is searched for takes the place of
-            a hunter's.
-        n_runs: Runs in each of the two worlds, >= 2.
-        rounds: Rounds of the search.
+        target: Kind of the vehicle that differs, in `agents.audit.planner.KINDS`.
+        policy: Queries, in `agents.audit.planner.POLICIES`.
+        trials: Runs in each of the two worlds, >= 2.
         noise_factor: Multiplies the real noise, not the declared one.
         confidence: Confidence of the lower bounds.
         seed: Seeds the noise, >= 0.
@@ -183,37 +151,17 @@ def audit_environment(
         ValueError: A kind or policy is unknown or does not suit the environment, the record has too
             few vehicles, or the release model cannot be checked (`residuals_of`).
     """
-    check_target(config, target, policy)
-    report, start = privacy_report(config), time.perf_counter()
-    noise = examine(residuals_of(config, record, noise_factor=noise_factor, seed=seed))
-    if target == CLIMBED:
-        options: dict[str, Any] = {"policy": policy, "seed": seed, "executor": executor}
-        worlds, plan = climb(config, record, rounds, **options)
-    else:
-        planner = Planner(config, policy)
+    planner = Planner(config, policy)
+    planner.require_kind(target)
+
+    def attacked(claim: Claim) -> Attack:
         worlds = planner.choose(record, target)
-        plan = planner.plan(worlds)
-    runs = attack(
-        config,
-        worlds,
-        plan,
-        n_runs,
-        noise_factor=noise_factor,
-        seed=seed,
-        executor=executor,
-    )
-    claim = claim_of(report)
-    return Finding(
-        title=_title(report),
-        target=worlds.description,
-        policy=policy,
-        noise_factor=noise_factor,
-        distance=float(runs.distances.max()),
-        result=audit(runs.scores[0], runs.scores[1], claim, confidence),
-        noise=noise,
-        privacy=report,
-        seconds=time.perf_counter() - start,
-    )
+        options: dict[str, Any] = {"noise_factor": noise_factor, "seed": seed, "executor": executor}
+        runs = attack(config, worlds, planner.plan(worlds), trials, **options)
+        result = audit(runs.scores[0], runs.scores[1], claim, confidence)
+        return Attack(worlds.description, policy, float(runs.distances.max()), result)
+
+    return _finding(config, record, attacked, noise_factor, seed)
 
 
 def audit_one_run(
@@ -239,30 +187,28 @@ def audit_one_run(
     Raises:
         ValueError: The release model cannot be checked (`residuals_of`).
     """
+
+    def attacked(claim: Claim) -> Attack:
+        run = attack_in_one_run(config, record, noise_factor=noise_factor, seed=seed)
+        target = f"each added vehicle {KINDS[run.design.kind]}, for {run.design.slot} s"
+        result = audit_coins(run.scores, run.coins, claim, confidence)
+        return Attack(target, "where they are", run.distance, result)
+
+    return _finding(config, record, attacked, noise_factor, seed)
+
+
+def _finding(
+    config: EnvConfig,
+    record: Record,
+    attacked: Callable[[Claim], Attack],
+    noise_factor: float,
+    seed: int,
+) -> Finding:
+    """Test the noise, and attack the claim to users."""
     report, start = privacy_report(config), time.perf_counter()
     noise = examine(residuals_of(config, record, noise_factor=noise_factor, seed=seed))
-    run = attack_in_one_run(config, record, noise_factor=noise_factor, seed=seed)
-    return Finding(
-        title=_title(report),
-        target=f"each added vehicle {KINDS[run.design.kind]}, for {run.design.slot} s",
-        policy="where they are",
-        noise_factor=noise_factor,
-        distance=run.distance,
-        result=audit_coins(run.scores, run.coins, claim_of(report), confidence),
-        noise=noise,
-        privacy=report,
-        seconds=time.perf_counter() - start,
-    )
-
-
-def check_target(config: EnvConfig, target: str, policy: str) -> None:
-    """Refuse a target or a policy that there is not.
-
-    Raises:
-        ValueError: See above.
-    """
-    targets = [*Planner(config, policy).kinds, CLIMBED]
-    require(target in targets, "target", f"one of {targets} here", target)
+    attack = attacked(claim_of(report))
+    return Finding(attack, noise, noise_factor, report, time.perf_counter() - start)
 
 
 def claim_of(report: PrivacyReport) -> Claim:
@@ -270,7 +216,3 @@ def claim_of(report: PrivacyReport) -> Claim:
     epsilon, delta = report.claimed_epsilon, report.claimed_delta
     mu = mu_of(epsilon, delta) if report.guarantee == "none" else report.mu
     return Claim(mu, epsilon, delta)
-
-
-def _title(report: PrivacyReport) -> str:
-    return f"preset {report.preset} at ({report.claimed_epsilon:g}, {report.claimed_delta:g})"

@@ -17,9 +17,9 @@ from scipy.special import ndtr
 from scipy.stats import chi2, halfnorm, kstest
 
 from agents.audit.attack import make_overheard
-from agents.audit.planner import random_plan
-from agents.audit.worlds import AdjacentWorlds, Trajectory
+from agents.audit.worlds import Trajectory, Worlds
 from dptse_env.config import EnvConfig
+from dptse_env.release import Queries
 from dptse_env.traffic import Record
 from dptse_env.utils.arrays import BoolArray, FloatArray
 
@@ -73,7 +73,7 @@ def residuals_of(
         ValueError: The release model does not let itself be checked: not all of its noise is that
             of a `dptse_env.release.noise.Noise`, or it does not state how large it is.
     """
-    alike = AdjacentWorlds(record, (Trajectory.absent(), Trajectory.absent()))
+    alike = Worlds.adjacent(record, (Trajectory.absent(), Trajectory.absent()))
     process, release = make_overheard(config, alike, BATCH, noise_factor)
     generator, every, name = np.random.default_rng(seed), np.arange(BATCH), release.task.name
     found = []
@@ -82,7 +82,8 @@ def residuals_of(
             every, generator.spawn(BATCH), {"traffic_seed": np.zeros(BATCH, int), "start": 0}
         )
         for _ in range(config.horizon_steps):
-            process.step(every, random_plan(release.task.queries, BATCH, generator).astype(np.int8))
+            plan = random_plan(release.task.queries, BATCH, generator)
+            process.step(every, plan.astype(np.int8))
             if release.square.any():
                 raise ValueError(
                     "the audit needs a release model whose attribute noise is all that is random, "
@@ -93,6 +94,15 @@ def residuals_of(
             found[-1][last.observed] = ((last.values - true) / last.sigma)[last.observed]
     rows = np.array(found).reshape(ROUNDS, -1, *true.shape)
     return rows.swapaxes(1, 2).reshape(-1, *true.shape[1:])
+
+
+def random_plan(queries: Queries, n: int, generator: np.random.Generator) -> BoolArray:
+    """Return as many random queries as can be paid for n times, (n, G)."""
+    ranked = np.argsort(generator.random((n, queries.n_queries)), axis=1)
+    paid = np.cumsum(queries.cost[ranked], axis=1) <= queries.bandwidth
+    plan = np.zeros(ranked.shape, dtype=bool)
+    np.put_along_axis(plan, ranked, paid, axis=1)
+    return plan
 
 
 def examine(residuals: FloatArray) -> NoiseTest:

@@ -131,6 +131,11 @@ class AuditResult:
         return self.epsilon is None
 
     @property
+    def detectable(self) -> float:
+        """Least mu for which the claim is rejected with probability 95 %, or infinity."""
+        return detectable_mu(self.claim.mu, self.n, self.confidence, is_one_run=self.is_one_run)
+
+    @property
     def verdict(self) -> Literal["rejected", "not rejected"]:
         """``rejected`` if a bound lies above the claim."""
         exceeds = self.mu.value > self.claim.mu or (

@@ -53,6 +53,9 @@ class Trajectory:
         return Trajectory(self.step[rows], self.segment[rows], self.speed[rows])
 
 
+Pair = tuple[Trajectory, Trajectory]
+
+
 class Worlds(RecordLibrary):
     """A library of records that differ in vehicles added to one traffic; their seeds count them.
 
@@ -63,19 +66,33 @@ class Worlds(RecordLibrary):
         added: The trajectories that are added in each record.
         pairs: Seeds of the two worlds between which an adversary has to decide by the transcript
             of each record, shape (n, 2).
+        description: The difference in words.
     """
 
     def __init__(
-        self, rest: Record, added: Sequence[Sequence[Trajectory]], pairs: npt.ArrayLike
-    ) -> None:
+        self, rest: Record, added: Sequence[Sequence[Trajectory]], pairs: npt.ArrayLike,
+        description: str = "",
+    ) -> None:  # fmt: skip
         """Add the vehicles to the rest."""
         super().__init__()
-        self.rest, self.added, self.pairs = rest, added, np.asarray(pairs, dtype=np.int64)
+        self.rest, self.added, self.description = rest, added, description
+        self.pairs = np.asarray(pairs, dtype=np.int64)
         self._records = [_add(rest, vehicles) for vehicles in added]
+
+    @classmethod
+    def adjacent(cls, rest: Record, pair: Pair, description: str = "") -> Worlds:
+        """Return two records that differ in one vehicle: world 0 under seed 0, 1 under seed 1."""
+        return cls(rest, [[each] for each in pair], [[0, 1], [0, 1]], description)
+
+    @property
+    def pair(self) -> Pair:
+        """The vehicle in either of two adjacent worlds."""
+        (zero,), (one,) = self.added
+        return zero, one
 
     def __reduce__(self) -> tuple[type[Worlds], tuple[Any, ...]]:
         """Pickle with the records, which no folder has."""
-        return type(self), (self.rest, self.added, self.pairs)
+        return type(self), (self.rest, self.added, self.pairs, self.description)
 
     def get(self, corridor: Corridor, seed: int) -> Record:
         """Return the record of a world."""
@@ -84,26 +101,6 @@ class Worlds(RecordLibrary):
     def missing(self, corridor: Corridor, seeds: Iterable[int]) -> list[int]:
         """Return nothing: no world is ever missing."""
         return []
-
-
-class AdjacentWorlds(Worlds):
-    """Two records that differ in one vehicle: world 0 under seed 0, world 1 under seed 1.
-
-    Attributes:
-        trajectories: The vehicle in either world.
-        description: The difference in words.
-    """
-
-    def __init__(
-        self, rest: Record, trajectories: tuple[Trajectory, Trajectory], description: str = ""
-    ) -> None:
-        """Add the vehicle to the rest."""
-        super().__init__(rest, [[each] for each in trajectories], [[0, 1], [0, 1]])
-        self.trajectories, self.description = trajectories, description
-
-    def __reduce__(self) -> tuple[type[AdjacentWorlds], tuple[Any, ...]]:
-        """See `Worlds`."""
-        return type(self), (self.rest, self.trajectories, self.description)
 
 
 def _add(rest: Record, added: Sequence[Trajectory]) -> Record:

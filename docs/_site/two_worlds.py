@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from agents.audit.attack import overheard
 from agents.audit.planner import public_plan
-from agents.audit.worlds import AdjacentWorlds, Trajectory
+from agents.audit.worlds import Trajectory, Worlds
 from agents.environments import make_config
 from agents.figures import COLOURS, WIDTH, add_frame, make_figure, save_figure
 from dptse_env.config import EnvConfig
@@ -43,14 +43,14 @@ class Transcript(NamedTuple):
     released: FloatArray
 
 
-def play(config: EnvConfig, worlds: AdjacentWorlds) -> Transcript:
+def play(config: EnvConfig, worlds: Worlds) -> Transcript:
     """Play world 0 under a round robin; keep ledgers as `Paced` does, but for its rounding."""
     T, clip, ratio = config.horizon_steps, config.privacy.clip, config.privacy.ratio
     mu = privacy_report(config).mu
     found = Transcript(*(np.full(shape, np.nan) for shape in ((2, T), (2, T), T, T)))
     trips = [
         {t: (s, v) for t, s, v in zip(trip.step, trip.segment, trip.speed, strict=True)}
-        for trip in worlds.trajectories
+        for trip in worlds.pair
     ]
     plan, paid = public_plan(config, "round-robin"), np.zeros(2)
     world_0, streams = np.zeros(1, dtype=np.int64), [np.random.default_rng(0)]
@@ -72,14 +72,14 @@ def play(config: EnvConfig, worlds: AdjacentWorlds) -> Transcript:
     return found
 
 
-def draw(config: EnvConfig, worlds: AdjacentWorlds, found: Transcript) -> Figure:
+def draw(config: EnvConfig, worlds: Worlds, found: Transcript) -> Figure:
     """Draw both worlds above, and what is published and paid below."""
     figure = make_figure(WIDTH, 6.2, dpi=160)
     (first, second), (published, ledger) = figure.subplots(2, 2, sharex=True)
     seconds = np.arange(1, found.square.size + 1)
     for world, axis in enumerate((first, second)):
         line = LINES[world]
-        trip = worlds.trajectories[world]
+        trip = worlds.pair[world]
         on_road = trip.only(trip.segment < config.corridor.geometry.n_mainline)
         draw_others(axis, worlds.rest, config.corridor.geometry.n_mainline)
         axis.plot(on_road.step, on_road.segment, **line)
@@ -137,7 +137,7 @@ def main() -> None:
     record = RecordLibrary().get(config.corridor, 0)
     trips = tuple(Trajectory.from_record(record, vehicle) for vehicle in VEHICLES)
     rest = record.without(VEHICLES[1]).without(VEHICLES[0])
-    worlds = AdjacentWorlds(rest, trips)
+    worlds = Worlds.adjacent(rest, trips)
     save_figure(draw(config, worlds, play(config, worlds)), PICTURE, "")
 
 

@@ -45,9 +45,9 @@ GUIDES = {
     "many-machines.md": {
         "--executor ray --address auto": "--executor local --workers 1",
         "--seeds 2000:2032": "--seeds 2000:2002",
-        "dptse audit": "dptse audit --runs 100 --env dptse_env:dptse/ShortHighway-v0",
+        "dptse audit": "dptse audit --trials 100 --env dptse_env:dptse/ShortHighway-v0",
     },
-    "audit.md": {"--runs 500": "--runs 100 --workers 1", "--one-run": "--one-run --workers 1"},
+    "audit.md": {"--trials 500": "--trials 100 --workers 1", "--one-run": "--one-run --workers 1"},
     "guarantee.md": {},
 }
 """Guides with commands, and passages of each with what runs in their place."""

@@ -35,7 +35,7 @@ COMMANDS = {
     "evaluate --suite short": (["--policies", "speed-front", *ONE], "card.json"),
     "study": (["examples.my_study:STUDY", *ONE], "tables.md"),
     "fit": (["road.toml", *ONE], "fit.md"),
-    "audit": (["--env", SHORT, *ONE], "printed-worst-case-hunter.json"),
+    "audit": (["--env", SHORT, *ONE], "audit.json"),
     "record": (["--env", SHORT, "--train-seeds", "0"], None),
     "import trajectories": (
         ["--files", "points.csv", "--format", "table", "--env", on("road.toml"), "--columns",

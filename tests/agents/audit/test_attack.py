@@ -9,7 +9,7 @@ import pytest
 from agents.audit.attack import attacked_form, make_overheard
 from agents.audit.planner import Planner, public_plan
 from agents.audit.statistics import Claim, audit
-from agents.audit.worlds import AdjacentWorlds, Trajectory
+from agents.audit.worlds import Trajectory, Worlds
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import ROUNDING, epsilon_of
 from dptse_env.release import Capped, CappedSettings, ReleaseModel
@@ -22,7 +22,7 @@ from .small import HORIZON, ROAD, config, paced, runs_of, staying
 
 def test_worlds_differ_in_one_vehicle(record):
     path, rest = Trajectory.from_record(record, 3), record.without(3)
-    worlds = AdjacentWorlds(rest, (path, Trajectory.absent()))
+    worlds = Worlds.adjacent(rest, (path, Trajectory.absent()))
     first, second = worlds.get(ROAD, 0), worlds.get(ROAD, 1)
     np.testing.assert_array_equal(first.counts, record.counts)
     np.testing.assert_allclose(first.speed_sums, record.speed_sums)
@@ -209,7 +209,7 @@ class AskedTooOften(Capped):
 @pytest.mark.parametrize("mechanism", [MECHANISMS["`capped`, half the noise"], AskedTooOften])
 def test_a_mechanism_of_ones_own_is_caught(mechanism, record):
     setting = config(preset=mechanism, epsilon=5.0, cap=2)
-    worlds = AdjacentWorlds(record, (staying(1), staying(3)))
+    worlds = Worlds.adjacent(record, (staying(1), staying(3)))
     everything = np.ones((HORIZON, ROAD.geometry.n_mainline), dtype=bool)
     setting = dataclasses.replace(setting, bandwidth=ROAD.geometry.n_mainline)
     assert verdict(setting, worlds, policy=everything) == "rejected"
@@ -228,6 +228,6 @@ class Silent(ReleaseModel):
 
 
 def test_what_cannot_be_audited_is_refused(record):
-    worlds = AdjacentWorlds(record, (staying(1), staying(3)))
+    worlds = Worlds.adjacent(record, (staying(1), staying(3)))
     with pytest.raises(ValueError, match=r"a release model with Gaussian noise.*Silent"):
         runs_of(config(preset=Silent), worlds, policy=np.ones((HORIZON, 6), dtype=bool))

@@ -7,7 +7,7 @@ import pytest
 
 from agents.audit.planner import Planner
 from agents.audit.statistics import Claim, audit
-from agents.audit.worlds import AdjacentWorlds, AuditedPenetration, Trajectory, audited
+from agents.audit.worlds import AuditedPenetration, Trajectory, Worlds, audited
 from dptse_env.config import resolve
 from dptse_env.parts import make_task, privacy_report
 from dptse_env.release import Capped
@@ -41,7 +41,7 @@ def record():
 def standing(record, segment=SENSOR):
     seconds = np.arange(1, HORIZON + 1)
     there = Trajectory.constant(seconds, segment, 0.0)
-    return AdjacentWorlds(record, (there, Trajectory.absent()))
+    return Worlds.adjacent(record, (there, Trajectory.absent()))
 
 
 def reached(setting, worlds, segment=SENSOR, *, queried=True):

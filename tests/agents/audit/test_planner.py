@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from agents.audit.planner import KINDS, Planner, plan_contributions, public_plan
-from agents.audit.worlds import AdjacentWorlds, Trajectory
+from agents.audit.worlds import Trajectory, Worlds
 from dptse_env.parts import privacy_report
+from dptse_env.release import Paced
 from tests.helpers import fast_and_slow
 
 from .small import HORIZON, ROAD, SECONDS, HalfTheLimit, config, paced, reached, staying
@@ -28,10 +29,10 @@ def test_moves_are_the_distance_of_a_second(preset, record):
         step, vehicle = int(record.step[row]), int(record.vehicle[row])
         path = Trajectory.from_record(record, vehicle)
         keep, moved = path.only(path.step != step), path.only(path.step == step)
-        rest = AdjacentWorlds(record.without(vehicle), (keep, keep)).get(ROAD, 0)
+        rest = Worlds.adjacent(record.without(vehicle), (keep, keep)).get(ROAD, 0)
         plan = np.zeros((HORIZON, ROAD.geometry.n_mainline), dtype=bool)
         plan[step - 1, int(record.segment[row])] = True
-        worlds = AdjacentWorlds(rest, (moved, Trajectory.absent()))
+        worlds = Worlds.adjacent(rest, (moved, Trajectory.absent()))
         distance = mu * reached(setting, worlds, plan, 1)
         # Deviations of speeds are rounded to the grid of the noise.
         assert distance**2 == pytest.approx(np.sum(moves**2), rel=1e-2)
@@ -45,7 +46,7 @@ def test_where_paths_meet_speeds_alone_tell(preset, record):
     paths = tuple(Trajectory.constant(np.array([20]), 2, speed) for speed in (5.0, 140.0))
     plan = np.zeros((HORIZON, ROAD.geometry.n_mainline), dtype=bool)
     plan[19, 2] = True
-    distance = reached(setting, AdjacentWorlds(record, paths), plan, 1)
+    distance = reached(setting, Worlds.adjacent(record, paths), plan, 1)
     first, second = (Planner(setting).moves(record, path)[0] for path in paths)
     assert record.counts[20, 2] > 0
     assert first[0] == second[0]
@@ -92,11 +93,16 @@ def test_the_worst_case_is_nearly_the_whole_of_mu(estimator, privacy, record):
     assert 0.97 < reached(setting, Planner(setting).choose(record, "worst-case")) <= 1.0
 
 
+def opposite(setting, record):
+    """The part of the worst case with two vehicles on one segment."""
+    return Planner(setting)._made_up(record)[1]
+
+
 def test_opposite_deviations_on_one_segment_are_a_worst_case(record):
     """Two vehicles and one query, where the centre leaves room for the clip on both sides."""
     for setting in (paced(HalfTheLimit, clip=51.0), config()):
-        worlds = Planner(setting).choose(record, "opposite")
-        slow, fast = worlds.trajectories
+        worlds = opposite(setting, record)
+        slow, fast = worlds.pair
         np.testing.assert_array_equal(slow.segment, fast.segment)
         assert set(slow.speed.tolist()) == {0.0}
         assert set(fast.speed.tolist()) == {ROAD.geometry.speed_limit}
@@ -108,10 +114,23 @@ def test_opposite_deviations_on_one_segment_are_a_worst_case(record):
         assert least < part <= 1.0 + 1e-9
 
 
+class RatioOfTwo(Paced):
+    """Charges too little where two vehicles on one segment deviate in opposite directions."""
+
+    def __init__(self, task, traffic):
+        object.__setattr__(task.settings, "ratio", 2.0)
+        super().__init__(task, traffic)
+
+
+def test_a_fault_that_two_vehicles_on_one_segment_show_is_found(record):
+    mutant = paced(HalfTheLimit, preset=RatioOfTwo, clip=51.0)
+    assert reached(mutant, Planner(mutant).choose(record, "worst-case")) > 1.05
+
+
 def test_a_lone_vehicle_is_the_worst_case_of_add_remove(record):
     setting = paced(adjacency="add_remove")
     worlds = Planner(setting).choose(record, "worst-case")
-    assert [len(path.step) for path in worlds.trajectories] == [HORIZON, 0]
+    assert [len(path.step) for path in worlds.pair] == [HORIZON, 0]
     assert 0.95 < reached(setting, worlds) <= 1.0
 
 
@@ -130,7 +149,6 @@ FEW = [
     ("deleted", config(cap=2), "round-robin"),
     ("replaced", config(boundary_inputs="private"), "hunter"),
     ("worst-case", paced("random_walk", adjacency="add_remove", ratio=20.0), "hunter"),
-    ("opposite", paced("random_walk", clip=5.0, ratio=0.1), "hunter"),
     ("deleted", paced("random_walk", unit="event"), "hunter"),
 ]
 ALL = [
@@ -141,7 +159,7 @@ ALL = [
         ("static", [paced("random_walk"), *CAPPED]),
     )
     for setting in settings
-    if setting.privacy.adjacency == "replace" or kind not in ("replaced", "opposite")
+    if setting.privacy.adjacency == "replace" or kind != "replaced"
     if (kind, setting, policy) not in FEW
 ]
 
@@ -164,8 +182,8 @@ def test_no_target_exceeds_mu(kind, setting, policy, record):
     worlds = Planner(setting, policy).choose(record, kind)
     assert reached(setting, worlds, policy) <= 1.0 + 1e-9
     if setting.privacy.unit == "event":
-        assert {len(path.step) for path in worlds.trajectories} <= {0, 1}
-        assert len({int(step) for path in worlds.trajectories for step in path.step}) == 1
+        assert {len(path.step) for path in worlds.pair} <= {0, 1}
+        assert len({int(step) for path in worlds.pair for step in path.step}) == 1
 
 
 @pytest.mark.parametrize("policy", ["hunter", "round-robin"])
@@ -175,7 +193,7 @@ def test_the_vehicle_that_is_deleted_tells_most(setting, policy, record):
     everyone = []
     for vehicle in range(record.n_vehicles):
         pair = Trajectory.from_record(record, vehicle), Trajectory.absent()
-        everyone.append(reached(setting, AdjacentWorlds(record.without(vehicle), pair), policy))
+        everyone.append(reached(setting, Worlds.adjacent(record.without(vehicle), pair), policy))
     # Prices are those of a typical episode, so that it is not always the best.
     least = 0.95 if setting.privacy.preset == "paced" else 1.0 - 1e-9
     assert chosen >= least * max(everyone)
@@ -194,7 +212,6 @@ def test_a_replaced_vehicle_tells_more_than_a_deleted_one(record):
     ("setting", "kind"),
     [
         (config(adjacency="add_remove"), "replaced"),
-        (paced(adjacency="add_remove"), "opposite"),
         (config(), "nobody"),
     ],
 )
@@ -218,7 +235,7 @@ def test_an_empty_road_has_no_target(kind, need, record):
 @pytest.mark.parametrize("bandwidth", [1, 2, 6])
 def test_the_hunter_keeps_to_bandwidth_and_cap(bandwidth, record):
     setting = config(bandwidth, cap=7)
-    worlds = AdjacentWorlds(record, (staying(0), staying(1)))
+    worlds = Worlds.adjacent(record, (staying(0), staying(1)))
     plan = Planner(setting).plan(worlds)
     assert plan.sum(axis=1).max() <= bandwidth
     # Seven for each of the two paths tell the whole of mu; then a ledger has to refuse.
@@ -230,7 +247,7 @@ def test_the_hunter_keeps_to_bandwidth_and_cap(bandwidth, record):
 
 def test_the_hunter_queries_the_seconds_that_reveal_most(record):
     path = Trajectory.from_record(record, 0)
-    worlds = AdjacentWorlds(record.without(0), (path, Trajectory.absent()))
+    worlds = Worlds.adjacent(record.without(0), (path, Trajectory.absent()))
     # The fixed sensor at the end of the road comes after them.
     free = path.only(path.segment < 5)
     best = free.step[np.argsort(-np.abs(np.clip(free.speed, 0, 102) - 51.0))[:3]]
@@ -246,7 +263,7 @@ def test_the_hunter_queries_where_the_two_trajectories_part(record):
     together = np.where(seconds <= 10, 1, 2), np.where(seconds <= 10, 1, 3)
     speeds = (np.where(seconds <= 10, first, 20.0) for first in (0.0, 80.0))
     paths = tuple(map(Trajectory, (seconds, seconds), together, speeds))
-    plan = Planner(config(bandwidth=2, cap=4)).plan(AdjacentWorlds(record, paths))
+    plan = Planner(config(bandwidth=2, cap=4)).plan(Worlds.adjacent(record, paths))
     assert plan[:10].sum() == 0
     assert plan[10:20, [2, 3]].sum() == plan.sum() == 20
 
@@ -256,7 +273,7 @@ def test_the_hunter_of_ledgers_follows_both_vehicles_every_second(bandwidth, rec
     setting = paced(bandwidth=bandwidth)
     places = SECONDS // 7 % 5, (SECONDS // 5 + 2) % 5
     paths = tuple(Trajectory(SECONDS, place, np.full(HORIZON, 30.0)) for place in places)
-    plan = Planner(setting).plan(AdjacentWorlds(record, paths))
+    plan = Planner(setting).plan(Worlds.adjacent(record, paths))
     followed = np.stack([plan[np.arange(HORIZON), place] for place in places])
     if bandwidth == 1:
         assert (followed[0] | followed[1]).all()
@@ -267,7 +284,7 @@ def test_the_hunter_of_ledgers_follows_both_vehicles_every_second(bandwidth, rec
     # What is left goes round; nothing is needed where a sensor stands.
     assert (plan.sum(axis=1) == bandwidth).all()
     assert bandwidth < 5 or (plan.sum(axis=0) > 0).all()
-    sensor = AdjacentWorlds(record, (staying(ROAD.fixed_sensors[0]), Trajectory.absent()))
+    sensor = Worlds.adjacent(record, (staying(ROAD.fixed_sensors[0]), Trajectory.absent()))
     np.testing.assert_array_equal(
         Planner(setting).plan(sensor), public_plan(setting, "round-robin")
     )
