@@ -14,9 +14,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from tyro.conf import Positional
 
 from agents.environments import make_config, parse_env, quietly
 from agents.executors import make_executor
+from agents.figures import save_figure
 from agents.fitting.budget import Errors, play_budgets
 from agents.fitting.choice import (
     ESTIMATORS_TRIED,
@@ -33,20 +33,19 @@ from agents.fitting.choice import (
     ROUND_ROBIN,
     Choice,
 )
-from agents.fitting.page import PAGE, Outcome, verdict, write_page
+from agents.fitting.page import DIAGRAM, PAGE, draw_diagram, verdict, write_page
 from agents.fitting.parameters import Fit, fit_parameters, is_stable, start_from, traffic_of
 from agents.fitting.road import PLAYED, Road, find_road, require_road, seeds_of
 from agents.fitting.road_file import copy_of, write_choice
 from agents.search.space import SPACE, Extra
 from agents.search.tuning import Search, chosen, tune, write_set
 from agents.seeds import KINDS
-from agents.study import Place
 from agents.tables import ERROR, Labels, values
 from agents.terminal import make_table
 from dptse_env.estimators import check_estimator
 from dptse_env.estimators.tuned import DEFAULT_PARAMETERS, tuned_with
 from dptse_env.model import available_parameters, load_parameters
-from dptse_env.model.parameters import read_parameters, write_parameters
+from dptse_env.model.parameters import write_parameters
 from dptse_env.traffic import RecordLibrary, ranges
 from dptse_env.traffic.roads import from_home
 from dptse_env.utils.files import replacing, require_output
@@ -65,24 +64,13 @@ from scripts.cli import (
 )
 
 STAGES, SEARCH, JOURNAL = "stages", "search.json", "trials.journal"
-STEPS = (
-    "record traffic", "fit ARZ parameters", "choose parameters", "choose an estimator",
-    "choose a query policy", "evaluate on test traffic, and over bandwidth and epsilon",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args(
-    Command,
-    Environment,
-    TrainSeeds,
-    ValidationSeeds,
-    TestSeeds,
-    Estimators,
-    Policies,
+    Command, Environment, TrainSeeds, ValidationSeeds, TestSeeds, Policies, Estimators, Machines,
     Seed,
-    Machines,
-):
+):  # fmt: skip
     """Fit a road."""
 
     road: Positional[Path | None] = None
@@ -183,55 +171,55 @@ def fit_road(args: Args, path: Path) -> None:
     """Fit, choose, evaluate, and write the page and the road file."""
     folder = args.output or folder_of(path)
     road, stages, copy = checked_road(args, path, folder), folder / STAGES, copy_of(path)
-    place, begin = args.place(stages), steps(args)
-    begin()
+    args.remark("[1/6] record traffic")
     library = args.library(road.corridor, road.all_seeds)
     dwell = road.measure_dwell(library)
     road.begin(stages, args.trials, dwell)
-    choice = Choice(road, stages, shipped_sets(road))
-    begin()
+    choice = Choice(road, args.place(stages), shipped_sets(road))
+    args.remark("[2/6] fit ARZ parameters")
     density, speed = traffic_of(road.corridor, road.seeds["training"], library)
-    fit = fitted(choice, place, library, args.trials, 1.01 * float(density.max()))
+    fit = fitted(choice, library, args.trials, 1.01 * float(density.max()))
     name = fit.parameters.name
     keep(folder / f"{name}.json", fit, road)
     choice.sets[name] = {"parameters": str(folder / f"{name}.json")}
-    begin()
+    args.remark("[3/6] choose parameters")
     choice.parameters = choice.home
-    choice.choose([{"parameters": each} for each in choice.sets], place)
-    notes = notes_on(choice, fit)
+    choice.choose([{"parameters": each} for each in choice.sets])
+    note_parameters(choice, fit)
     if args.keep_fitted:
         choice.parameters = name
-    begin()
+    args.remark("[4/6] choose an estimator")
     estimators = args.estimators or ESTIMATORS_TRIED
-    options: list[Mapping[str, str]] = [{"estimator": each} for each in estimators]
+    options: list[Labels] = [{"estimator": each} for each in estimators]
     if road.present:
         choice.sets[PRESENT] = dict(road.present)
         estimator = str(road.present.get("estimator", road.config.estimator))
         options.append({"parameters": PRESENT, "estimator": estimator})
-    choice.choose(options, place)
-    begin()
+    choice.choose(options)
+    args.remark("[5/6] choose a query policy")
     policies = args.policies or POLICIES_TRIED
-    choice.choose([{"policy": each} for each in policies], place)
-    begin()
-    played = choice.play(test_cells(choice, estimators, policies), place)
-    budgets = play_budgets(choice, place)
+    choice.choose([{"policy": each} for each in policies])
+    args.remark("[6/6] evaluate on test traffic, and over bandwidth and epsilon")
+    played = choice.play(test_cells(choice, estimators, policies))
+    budgets = play_budgets(choice)
 
     keywords = chosen_keywords(choice, road)
-    notes += [*inherits(choice, keywords), *road.remarks, *dict.fromkeys(choice.refused)]
+    choice.notes += [*inherits(choice, keywords), *road.remarks]
+    n = road.corridor.geometry.n_mainline
     sets = {each: choice.config(parameters=each).parameters for each in (choice.home, name)}
-    following = commands(args, choice, folder)
-    outcome = Outcome(choice, played, budgets, sets, density, speed, dwell, notes, following)
-    write_page(outcome, place, folder)
+    diagram = draw_diagram(density[:, :n], speed[:, :n], sets)
+    save_figure(diagram, folder / DIAGRAM, f"{road.corridor.name}, training traffic")
+    write_page(choice, played, budgets, following(args, choice, folder), folder)
     changed = write_choice(
         path,
         {key: _in_file(path, value) for key, value in keywords.items()},
         dwell if "average_dwell" in road.assumed else None,
     )
-    said = [verdict(choice), *(f"- {note}" for note in notes)]
+    said = [verdict(choice), *(f"- {note}" for note in choice.notes)]
     if changed:
         said.append(f"{path} has the table [environment] now; {copy} is as it was")
     said.append(f"{folder / PAGE} has the tables, and says what to do next")
-    args.answer(as_json(choice, keywords, notes, played, budgets), *said)
+    args.answer(as_json(choice, keywords, played, budgets), *said)
 
 
 def checked_road(args: Args, path: Path, folder: Path) -> Road:
@@ -249,34 +237,14 @@ def checked_road(args: Args, path: Path, folder: Path) -> Road:
     return road
 
 
-def steps(args: Args) -> Callable[[], None]:
-    """Return a function that says which of `STEPS` begins."""
-    waiting = enumerate(STEPS, 1)
-
-    def begin() -> None:
-        number, step = next(waiting)
-        args.remark(f"[{number}/{len(STEPS)}] {step}")
-
-    return begin
-
-
 def as_json(
-    choice: Choice,
-    keywords: Mapping[str, Any],
-    notes: Sequence[str],
-    played: Sequence[Labels],
-    budgets: Errors,
+    choice: Choice, keywords: Mapping[str, Any], played: Sequence[Labels], budgets: Errors
 ) -> dict[str, Any]:
     """Return what was chosen, and the errors x 1000 on each seed of test traffic."""
     return {
-        "parameters": choice.parameters,
-        "estimator": choice.estimator,
-        "policy": choice.policy,
+        **{key: getattr(choice, key) for key in ("parameters", "estimator", "policy", "notes")},
         "environment": keywords,
-        "notes": notes,
-        "test": [
-            {**labels, "error": values(choice.rows, labels, ERROR).tolist()} for labels in played
-        ],
+        "test": [{**each, "error": values(choice.rows, each, ERROR).tolist()} for each in played],
         "budgets": [
             {"bandwidth": bandwidth, "epsilon": epsilon, "error": errors.tolist()}
             for (bandwidth, epsilon), errors in budgets.items()
@@ -291,29 +259,23 @@ def shipped_sets(road: Road) -> dict[str, dict[str, Any]]:
     return {name: {"parameters": name} for name in stable}
 
 
-def fitted(
-    choice: Choice, place: Place, library: RecordLibrary, trials: int, densest: float
-) -> Fit:
+def fitted(choice: Choice, library: RecordLibrary, trials: int, densest: float) -> Fit:
     """Search parameters, from the shipped set with which the filter errs least in training."""
     road, base = choice.road, DEFAULT_PARAMETERS
     plain = {"estimator": FILTER, "policy": ROUND_ROBIN}
     if choice.sets:
         options = [choice.labels("training", parameters=name, **plain) for name in choice.sets]
-        base = choice.best(choice.play(options, place))["parameters"]
+        base = choice.best(choice.play(options))["parameters"]
     name = road.corridor.name
     name = f"{name}-road" if name in available_parameters() else name
     start = start_from(load_parameters(base), road.corridor, name)
     cell = choice.cell(choice.labels("training", parameters="", **plain))
-    return fit_parameters(
-        road.corridor, cell, road.seeds["training"], start, densest, library, trials,
-        choice.stages / SEARCH,
-    )  # fmt: skip
+    kept = choice.place.folder / SEARCH
+    return fit_parameters(cell, road.corridor, start, densest, library, trials, kept)
 
 
 def keep(path: Path, fit: Fit, road: Road) -> None:
-    """Write the fitted set with its provenance, unless it is there: its date is part of rows."""
-    if path.exists() and read_parameters(path) == fit.parameters:
-        return
+    """Write the fitted set with its provenance."""
     provenance = {
         "corridor": road.corridor.name,
         "env": road.env,
@@ -321,31 +283,30 @@ def keep(path: Path, fit: Fit, road: Road) -> None:
         "error_at_start": fit.start,
         "error": fit.error,
         "at_bounds": fit.at_bounds,
-        "date": date.today().isoformat(),
         "version": code_version(),
     }
     with replacing(path) as temporary:
         write_parameters(temporary, fit.parameters, provenance)
 
 
-def notes_on(choice: Choice, fit: Fit) -> list[str]:
-    """Say what the fit of the parameters gave, after they were chosen on validation traffic."""
+def note_parameters(choice: Choice, fit: Fit) -> None:
+    """Note what the fit of the parameters gave, after they were chosen on validation traffic."""
     name = fit.parameters.name
-    found = [
+    choice.notes.append(
         f"on training traffic the search took the error x 1000 of an EKF from {fit.start:.1f}, "
         f"with {fit.parameters.derived_from}, to {fit.error:.1f}"
-    ]
+    )
     if choice.parameters != name:
         errors = [
             values(choice.rows, choice.labels("validation", parameters=each), ERROR).mean()
             for each in (name, choice.parameters)
         ]
-        found.append(
+        choice.notes.append(
             f"the fitted parameters are not written: on validation traffic an EKF errs "
             f"{errors[0]:.1f} with them and {errors[1]:.1f} with {choice.parameters}, which is no "
             "certain gain; --keep-fitted writes them"
         )
-    return [*found, *fit.at_bounds]
+    choice.notes += fit.at_bounds
 
 
 def test_cells(
@@ -374,11 +335,9 @@ def chosen_keywords(choice: Choice, road: Road) -> dict[str, Any]:
 def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:
     """Say which values of other roads stay in force, as ``info["inherited"]`` does."""
     road = choice.road
+    played = {**road.keywords, **keywords, "corridor": str(choice.place.folder / PLAYED)}
     with quietly():
-        config = make_config(
-            road.env,
-            {**road.keywords, **keywords, "corridor": str(choice.stages / PLAYED)},
-        )
+        config = make_config(road.env, played)
     said = {
         "parameters": f"the parameters {config.parameters.name} were fitted to another road",
         "estimator_settings": (
@@ -389,38 +348,31 @@ def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:
     return [said.get(key, f"{key} is of another road") for key in config.inherited]
 
 
-def commands(args: Args, choice: Choice, folder: Path) -> list[tuple[str, str]]:
+def following(args: Args, choice: Choice, folder: Path) -> str:
     """Return what to do next, as command lines that run."""
-    road = choice.road
+    road, quote = choice.road, shlex.quote
     given = {**parse_env(args.env)[1], "corridor": road.path.as_posix()}
-    env = shlex.quote(f"{road.env} {json.dumps(given)}")
-    seeds = {kind: f"{each[0]}:{each[-1] + 1}" for kind, each in road.seeds.items()}
-    policies = " ".join(dict.fromkeys((ROUND_ROBIN, shlex.quote(choice.policy))))
-    start, policy = f"--env {env}", folder / "policy"
-    evaluate = f"dptse evaluate {start} --test-seeds {seeds['test']} --reference {ROUND_ROBIN}"
-    return [
-        (
-            "Look at episodes of the chosen policy in a browser:",
-            f"{evaluate} --policies {policies} --html --output {folder / 'evaluation'}",
-        ),
-        (
-            "Train a query policy, some minutes:",
-            f"dptse train {start} --steps 300000 --train-seeds {seeds['training']} "
-            f"--validation-seeds {seeds['validation']} --output {policy}",
-        ),
-        (
-            "Compare it with the rules:",
-            f"{evaluate} --policies {policies} {policy / 'best.safetensors'} "
-            f"--output {folder / 'comparison'}",
-        ),
-        (
-            "Tune the settings of the EKF on this road, and name the file that it writes in the "
-            "table [environment] of the road file:",
-            f"dptse fit --tune {shlex.quote(str(road.path))} --env {shlex.quote(args.env)} "
-            f"--estimators {FILTER} --policies {ROUND_ROBIN} --also demand noise-scale "
-            f"--train-seeds {seeds['training']} --output {folder / 'tuned'}",
-        ),
-    ]
+    env = quote(f"{road.env} {json.dumps(given)}")
+    train, validation, test = (f"{each[0]}:{each[-1] + 1}" for each in road.seeds.values())
+    evaluation, policy, comparison, tuned = (
+        quote(str(folder / name)) for name in ("evaluation", "policy", "comparison", "tuned")
+    )
+    rules = " ".join(dict.fromkeys((ROUND_ROBIN, quote(choice.policy))))
+    evaluate = f"""\
+dptse evaluate --env {env} \\
+    --test-seeds {test} --reference {ROUND_ROBIN} --policies {rules}"""
+    return f"""\
+# look at episodes of the chosen policy in a browser
+{evaluate} --html --output {evaluation}
+# train a query policy, some minutes, and compare it with the rules
+dptse train --env {env} \\
+    --steps 300000 --train-seeds {train} --validation-seeds {validation} --output {policy}
+{evaluate} {policy}/best.safetensors --output {comparison}
+# tune the EKF on this road, and name the file in the table [environment] of the road file
+dptse fit --tune {quote(str(road.path))} --env {quote(args.env)} \\
+    --estimators {FILTER} --policies {ROUND_ROBIN} --also demand noise-scale \\
+    --train-seeds {train} --output {tuned}
+"""
 
 
 def _in_file(path: Path, value: Any) -> Any:

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import polars as pl
 
 from agents.fitting.choice import FEW, Choice, interval, is_less
-from agents.study import Place
 from agents.tables import ERROR, Labels, markdown, values
 from dptse_env.utils.arrays import FloatArray
 
@@ -24,10 +23,10 @@ Errors = Mapping[tuple[int, float], FloatArray]
 """Errors x 1000 on each seed of test traffic, by bandwidth and epsilon."""
 
 
-def play_budgets(choice: Choice, place: Place) -> Errors:
+def play_budgets(choice: Choice) -> Errors:
     """Play what was chosen over bandwidths and epsilons, and without queries at each epsilon.
 
-    What the environment refuses is left out, and the first reason stands among `Choice.refused`.
+    What the environment refuses is left out.
     """
     config = choice.road.config
     n, own = config.corridor.geometry.n_mainline, config.privacy.epsilon
@@ -37,9 +36,8 @@ def play_budgets(choice: Choice, place: Place) -> Errors:
         wanted[0, epsilon] = choice.labels("test", policy=NOTHING, epsilon=epsilon)
         for bandwidth in ladder:
             wanted[bandwidth, epsilon] = choice.labels("test", bandwidth=bandwidth, epsilon=epsilon)
-    seeds, n_refused = choice.road.seeds["test"][:SEEDS], len(choice.refused)
-    played = choice.play([*wanted.values()], place, seeds)
-    del choice.refused[n_refused + 1 :]
+    seeds = choice.road.seeds["test"][:SEEDS]
+    played = choice.play([*wanted.values()], seeds)
     rows = choice.rows.filter(pl.col("traffic_seed").is_in(seeds))
     return {key: values(rows, labels, ERROR) for key, labels in wanted.items() if labels in played}
 

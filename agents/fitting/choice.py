@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import polars as pl
@@ -38,6 +37,9 @@ POLICIES_TRIED = (
 )  # fmt: skip
 """Query policies among which it chooses."""
 
+NOISE = {"training": TUNING, "validation": CHOICE, "test": EVALUATION}
+"""Seeds of the noise by kind of traffic."""
+
 FEW = 4
 """Seeds of validation traffic below which a choice is by the mean alone."""
 
@@ -51,9 +53,9 @@ class Choice:
 
     Attributes:
         road: The road.
-        stages: Folder of the rows.
+        place: Folder of the rows, and what plays them.
         sets: Keywords of each set of parameters and settings, by its name.
-        refused: What could not be played, and why, a sentence each.
+        notes: What the reader should know, a sentence each, such as what could not be played.
         parameters: The chosen set.
         estimator: The chosen estimator.
         policy: The chosen query policy.
@@ -61,9 +63,9 @@ class Choice:
     """
 
     road: Road
-    stages: Path
+    place: Place
     sets: dict[str, dict[str, Any]]
-    refused: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     parameters: str = ""
     estimator: str = FILTER
     policy: str = ROUND_ROBIN
@@ -92,18 +94,17 @@ class Choice:
         """Return the cell of some labels, on given traffic or all of the kind that they name."""
         keywords = {
             **self.road.keywords,
-            "corridor": str(self.stages / PLAYED),
+            "corridor": str(self.place.folder / PLAYED),
             **{key: labels[key] for key in ("estimator", "bandwidth", "epsilon")},
             **self.sets.get(labels["parameters"], {}),
         }
-        noise = {"training": TUNING.start, "validation": CHOICE.start, "test": EVALUATION.start}
         traffic = labels["traffic"]
         return Cell(
             self.road.env,
             labels["policy"],
             keywords,
             labels,
-            noise_seed=noise[traffic],
+            noise_seed=NOISE[traffic].start,
             transferred=True,
             watchers=("honesty",),
             seeds=tuple(seeds) or self.road.seeds[traffic],
@@ -115,10 +116,11 @@ class Choice:
         with quietly():
             return make_config(cell.env, cell.all_keywords)
 
-    def play(
-        self, wanted: Sequence[Labels], place: Place, seeds: Sequence[int] = ()
-    ) -> list[Labels]:
-        """Play cells, and return the labels of those that the environment does not refuse."""
+    def play(self, wanted: Sequence[Labels], seeds: Sequence[int] = ()) -> list[Labels]:
+        """Play cells, and return the labels of those that the environment does not refuse.
+
+        Of what it refuses for one reason, the first cell is noted.
+        """
         cells = {}
         for labels in wanted:
             cell = self.cell(labels, seeds)
@@ -126,18 +128,19 @@ class Choice:
                 cell.check()
             except ValueError as problem:
                 tried = ", ".join(f"{key} {value}" for key, value in [*labels.items()][1:])
-                self.refused.append(f"{tried}: {problem}")
+                if not any(note.endswith(f": {problem}") for note in self.notes):
+                    self.notes.append(f"refused is {tried}: {problem}")
             else:
                 cells[cell.id] = cell
         study = Study(NAME, tuple(cells.values()), (), lambda rows, folder: "")
-        self.rows = play_study(study, place._replace(folder=self.stages))
+        self.rows = play_study(study, self.place)
         return [cell.labels for cell in cells.values()]
 
     def best(self, played: Sequence[Labels]) -> Labels:
         """Return the labels of the smallest mean error."""
         return min(played, key=lambda labels: float(values(self.rows, labels, ERROR).mean()))
 
-    def choose(self, options: Sequence[Labels], place: Place) -> None:
+    def choose(self, options: Sequence[Labels]) -> None:
         """Play changes of what is chosen on validation traffic, and choose the best one.
 
         What is chosen stays unless the best one errs less with 95 % confidence, or the traffic has
@@ -146,9 +149,9 @@ class Choice:
         Raises:
             ValueError: The environment refuses all of them.
         """
-        played = self.play([self.labels("validation", **changes) for changes in options], place)
+        played = self.play([self.labels("validation", **changes) for changes in options])
         if not played:
-            raise ValueError(f"{self.road.path}: {self.refused[-1]}")
+            raise ValueError(f"{self.road.path}: {self.notes[-1]}")
         best, now = self.best(played), self.labels("validation")
         if now not in played or is_less(*(values(self.rows, each, ERROR) for each in (best, now))):
             self.parameters, self.estimator, self.policy = (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,6 @@ from agents.fitting.budget import SEEDS, Errors, advice, budget_table
 from agents.fitting.choice import FILTER, ROUND_ROBIN, Choice, interval
 from agents.page import watch
 from agents.statistics import mean_interval
-from agents.study import Place
 from agents.tables import DENSITY, ERROR, SPEED, Labels, error_label, markdown, values
 from dptse_env.model import ARZParameters
 from dptse_env.utils.arrays import FloatArray
@@ -34,40 +32,23 @@ PAGE, DIAGRAM, EPISODE = "fit.md", "speed-density.png", "episode.png"
 """Files in the folder of a fit."""
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The content of a page.
+def write_page(
+    choice: Choice, played: Sequence[Labels], budgets: Errors, following: str, folder: Path
+) -> None:
+    """Write the page and the figure of an episode into a folder that has the other figure.
 
-    Attributes:
-        choice: What was compared and chosen, with the rows of test traffic.
+    Args:
+        choice: What was compared and chosen.
         played: Labels of what was played on test traffic.
         budgets: Errors over bandwidth and epsilon.
-        sets: The sets that the speed-density diagram shows.
-        density: Densities for a lane in training traffic [veh/km], shape (n, S).
-        speed: Speeds [km/h] in the same places.
-        dwell: Measured average dwell [s].
-        notes: What the reader should know of the fit, a sentence each.
-        commands: What to do next: a word for each command line.
+        following: Command lines for what to do next.
+        folder: The folder.
     """
-
-    choice: Choice
-    played: Sequence[Labels]
-    budgets: Errors
-    sets: Mapping[str, ARZParameters]
-    density: FloatArray
-    speed: FloatArray
-    dwell: float
-    notes: Sequence[str]
-    commands: Sequence[tuple[str, str]]
-
-
-def write_page(outcome: Outcome, place: Place, folder: Path) -> None:
-    """Write the page and its figures into a folder."""
-    choice, road = outcome.choice, outcome.choice.road
-    n, name = len(road.seeds["test"]), road.corridor.name
-    seed = road.seeds["test"][0]
-    save_figure(draw_diagram(outcome), folder / DIAGRAM, f"{name}: training traffic")
-    save_figure(draw_episode(choice, seed, place), folder / EPISODE, f"{name}, traffic seed {seed}")
+    road = choice.road
+    n, seed = len(road.seeds["test"]), road.seeds["test"][0]
+    save_figure(
+        draw_episode(choice, seed), folder / EPISODE, f"{road.corridor.name}, traffic seed {seed}"
+    )
     intervals = (
         "There is one test window: its errors have no interval, and another day may differ by more "
         "than the estimators do." if n < 2 else
@@ -75,7 +56,7 @@ def write_page(outcome: Outcome, place: Place, folder: Path) -> None:
         "noise."
     )  # fmt: skip
     parts = [
-        f"# {name}",
+        f"# {road.corridor.name}",
         verdict(choice),
         f"{heading(road.env, choice.config())}.",
         "Parameters, estimator and policy were chosen on validation traffic. All errors below are "
@@ -83,19 +64,18 @@ def write_page(outcome: Outcome, place: Place, folder: Path) -> None:
         "reported deviations: 1 is honest.",
         "## Bandwidth and epsilon",
         f"Error x 1000 of what was chosen, on the first {min(n, SEEDS)} episodes:",
-        budget_table(outcome.budgets),
-        advice(outcome.budgets, road.config.privacy.epsilon),
-        *tables(outcome),
+        budget_table(budgets),
+        advice(budgets, road.config.privacy.epsilon),
+        *tables(choice, played),
         "## Traffic",
         f"![Speeds over densities of a lane, and the curve of each set of parameters]({DIAGRAM})",
-        f"The average dwell on a mainline segment is {outcome.dwell:g} s. v_f is a shape of the "
-        "curve, not a speed that anyone drives.",
+        "v_f is a shape of the curve, not a speed that anyone drives.",
         f"![True and estimated density, and queries, over space and time]({EPISODE})",
         "## What to know",
-        "\n".join(f"- {note}" for note in outcome.notes),
+        "\n".join(f"- {note}" for note in choice.notes),
         "## What to do next",
+        f"```bash\n{following}```",
     ]  # fmt: skip
-    parts += [f"{word}\n\n```bash\n{command}\n```" for word, command in outcome.commands]
     write_atomically(folder / PAGE, "\n\n".join(parts) + "\n")
 
 
@@ -122,9 +102,9 @@ def against(choice: Choice, labels: Labels, reference: Labels) -> str:
     return f"{found.mean:+.1f} ± {found.half_width:.1f} %"
 
 
-def tables(outcome: Outcome) -> list[str]:
+def tables(choice: Choice, played: Sequence[Labels]) -> list[str]:
     """Return titles and tables of parameters, estimators and policies, the smallest error first."""
-    choice, parts = outcome.choice, list[str]()
+    parts = list[str]()
     robin = choice.labels("test", policy=ROUND_ROBIN)
     ekf = {**robin, "estimator": FILTER}
     for key, title, first in (
@@ -132,7 +112,7 @@ def tables(outcome: Outcome) -> list[str]:
         ("estimator", f"Estimators, with {choice.parameters} and a round robin", robin),
         ("policy", f"Query policies, with {choice.parameters} and {choice.estimator}", robin),
     ):
-        rows = [each for each in outcome.played if {**each, key: ""} == {**first, key: ""}]
+        rows = [each for each in played if {**each, key: ""} == {**first, key: ""}]
         references = {**ekf, "parameters": choice.home}, ekf, robin
         reference = next((each for each in references if each in rows), rows[0])
         parts += [f"## {title}", _table(choice, key, rows, reference)]
@@ -154,15 +134,22 @@ def _table(choice: Choice, key: str, rows: Sequence[Labels], reference: Labels) 
     return markdown(["", *head, f"against {reference[key]}", "χ² density", "χ² speed"], body)
 
 
-def draw_diagram(outcome: Outcome) -> Figure:
-    """Draw speeds over densities of the mainline, with the equilibrium of each set."""
-    n = outcome.choice.road.corridor.geometry.n_mainline
-    density, speed = outcome.density[:, :n].ravel(), outcome.speed[:, :n].ravel()
+def draw_diagram(
+    density: FloatArray, speed: FloatArray, sets: Mapping[str, ARZParameters]
+) -> Figure:
+    """Draw speeds over densities, and the equilibrium of each set.
+
+    Args:
+        density: Densities for a lane [veh/km], shape (n, S).
+        speed: Speeds [km/h] in the same places.
+        sets: ARZ parameters by name.
+    """
+    density, speed = density.ravel(), speed.ravel()
     shown = np.random.default_rng(0).permutation(np.flatnonzero(density > 0.0))[:8000]
     figure = make_figure(WIDTH, 3.6)
     axis = figure.subplots()
     axis.plot(density[shown], speed[shown], ".", color="#9aa7b4", markersize=1.5, alpha=0.4)
-    for (name, each), colour in zip(outcome.sets.items(), COLOURS, strict=False):
+    for (name, each), colour in zip(sets.items(), COLOURS, strict=False):
         jam = each.jam_density / each.lanes
         rho = np.linspace(0.0, min(jam, 1.05 * float(density.max())), 200)
         axis.plot(
@@ -176,9 +163,10 @@ def draw_diagram(outcome: Outcome) -> Figure:
     return finish_figure(figure, columns=1)
 
 
-def draw_episode(choice: Choice, seed: int, place: Place) -> Figure:
+def draw_episode(choice: Choice, seed: int) -> Figure:
     """Draw truth, estimate and queries of an episode of test traffic, as it was chosen."""
-    episode = watch(choice.policy, choice.cell(choice.labels("test")), seed, place.records)
+    cell = choice.cell(choice.labels("test"))
+    episode = watch(choice.policy, cell, seed, choice.place.records)
     history = episode.history
     panels = [
         RoadMap("true density", history.truth, history),

@@ -108,9 +108,8 @@ def is_stable(parameters: ARZParameters, corridor: Corridor) -> bool:
 
 
 def fit_parameters(
-    corridor: Corridor,
     cell: Cell,
-    seeds: Sequence[int],
+    corridor: Corridor,
     start: ARZParameters,
     densest: float,
     library: RecordLibrary,
@@ -123,9 +122,8 @@ def fit_parameters(
     interrupted.
 
     Args:
+        cell: The filter and the query policy on training traffic, without parameters.
         corridor: The road.
-        cell: The filter and the query policy, without parameters.
-        seeds: Training traffic.
         start: Where the search begins.
         densest: Largest density for a lane in training traffic [veh/km]; no jam is less dense.
         library: Source of the records.
@@ -156,7 +154,7 @@ def fit_parameters(
         if key not in tried:
             tried[key] = _REFUSED
             if is_stable(parameters, corridor):
-                tried[key] = filter_error(cell, parameters, seeds, library)
+                tried[key] = filter_error(cell, parameters, library)
             write_json(kept, [[*each, error] for each, error in tried.items()])
         shown.update()
         shown.set_postfix_str(f"error {min(tried.values()):.1f}")
@@ -189,15 +187,14 @@ def fit_parameters(
     )
 
 
-def filter_error(
-    cell: Cell, parameters: ARZParameters, seeds: Sequence[int], library: RecordLibrary
-) -> float:
+def filter_error(cell: Cell, parameters: ARZParameters, library: RecordLibrary) -> float:
     """Return the mean error x 1000 of a filter with given parameters.
 
     All episodes are one batch: the steps of a batch take little longer than those of an episode.
     """
     keywords = {**cell.keywords, "parameters": dataclasses.asdict(parameters)}
-    rows = play(dataclasses.replace(cell, keywords=keywords, watchers=()), seeds, library)
+    cell = dataclasses.replace(cell, keywords=keywords, watchers=())
+    rows = play(cell, cell.seeds or (), library)
     return float(np.mean([-1000.0 * row["reward"] for row in rows]))
 
 

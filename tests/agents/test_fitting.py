@@ -165,7 +165,7 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
     corridor, cell, library = search_of(tmp_path)
     tried = []
 
-    def error(cell, parameters, seeds, library):
+    def error(cell, parameters, library):
         if len(tried) == 7:
             raise KeyboardInterrupt
         tried.append(parameters)
@@ -175,7 +175,7 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
         tmp_path / "search.json",
         start_from(load_parameters("published"), corridor, "mine"),
     )
-    arguments = corridor, cell, (0,), start, 100.0, library, 60, kept
+    arguments = cell, corridor, start, 100.0, library, 60, kept
     monkeypatch.setattr(searching, "filter_error", error)
     with pytest.raises(KeyboardInterrupt):
         fit_parameters(*arguments)
@@ -231,7 +231,7 @@ def test_the_search_finds_the_least_error_and_says_where_it_ended_at_a_bound(tmp
     def fit(error, name):
         monkeypatch.setattr(searching, "filter_error", lambda *given: error(given[1]))
         kept = tmp_path / name
-        return fit_parameters(corridor, cell, (0,), start, 100.0, library, 100, kept)
+        return fit_parameters(cell, corridor, start, 100.0, library, 100, kept)
 
     inside = fit(bowl, "inside.json")
     assert inside.parameters.free_flow_speed == pytest.approx(95.0, rel=0.05)
@@ -265,14 +265,15 @@ def test_a_choice_changes_for_what_is_certainly_better(errors, chosen, tmp_path,
     path.write_text(ROAD)
     seeds = {"training": "0:1", "validation": "1000:1001", "test": "2000:2001"}
     road = find_road(path, ID, tmp_path / "fit", seeds)
-    choice = Choice(road, tmp_path, {"w99-3lane": {}}, parameters="w99-3lane")
-    monkeypatch.setattr(choosing.Choice, "play", lambda self, wanted, place: wanted)
+    place = Place(tmp_path, this_process)
+    choice = Choice(road, place, {"w99-3lane": {}}, parameters="w99-3lane")
+    monkeypatch.setattr(choosing.Choice, "play", lambda self, wanted: wanted)
     monkeypatch.setattr(
         choosing,
         "values",
         lambda rows, labels, metric: np.array(errors[labels["estimator"]], float),
     )
-    choice.choose([{"estimator": name} for name in errors], Place(tmp_path, this_process))
+    choice.choose([{"estimator": name} for name in errors])
     assert (choice.estimator, choice.policy) == (chosen, "round-robin")
 
 
