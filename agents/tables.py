@@ -55,7 +55,8 @@ def pick(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
     found = _with_labels(rows, labels)
     if found.is_empty():
         raise UnmeasuredError(dict(labels))
-    return _one_cell(found.filter(pl.col("version") == found["version"][-1]), labels)
+    versions = numbers(found)
+    return _one_cell(found.filter(versions == versions[-1]), labels)
 
 
 def pick_paired(rows: pl.DataFrame, *cells: Labels) -> list[pl.DataFrame]:
@@ -67,34 +68,24 @@ def pick_paired(rows: pl.DataFrame, *cells: Labels) -> list[pl.DataFrame]:
         UnmeasuredError: With none were all of them played on two traffic seeds.
         ValueError: Labels are those of several cells.
     """
+    rows = rows.with_columns(version=numbers(rows))
     found = [_with_labels(rows, each) for each in cells]
-    shared = found[0].select(*_PAIRED).unique(maintain_order=True)
-    for each in found[1:]:
-        shared = shared.join(each, on=_PAIRED, how="semi", maintain_order="left")
-    if not shared.is_empty():
-        shared = shared.filter(pl.col("version") == shared["version"][-1])
-    if len(shared) < 2:
+    played = [dict.fromkeys(each.select("version", "traffic_seed").iter_rows()) for each in found]
+    shared = [key for key in played[0] if all(key in each for each in played[1:])]
+    seeds = [seed for version, seed in shared if version == shared[-1][0]]
+    if len(seeds) < 2:
         raise UnmeasuredError(
             "cells were not played on two traffic seeds by versions of equal numbers", *cells
         )
     return [
-        _one_cell(each.join(shared, on=_PAIRED, how="semi"), labels)
+        _one_cell(each.filter(pl.col("traffic_seed").is_in(seeds), version=shared[-1][0]), labels)
         for each, labels in zip(found, cells, strict=True)
     ]
 
 
-_PAIRED = ("version", "traffic_seed")
-
-
 def _with_labels(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:
-    """Return the rows that have some labels, with the name of their numbers for the version.
-
-    A part that was not played has no column.
-    """
-    if not labels.keys() <= set(rows.columns):
-        return rows.clear()
-    found = rows.filter(*(pl.col(name) == value for name, value in labels.items()))
-    return found.with_columns(version=numbers(found))
+    """Return the rows that have some labels; a part that was not played has no column."""
+    return rows.filter(**labels) if labels.keys() <= set(rows.columns) else rows.clear()
 
 
 def _one_cell(rows: pl.DataFrame, labels: Labels) -> pl.DataFrame:

@@ -51,12 +51,11 @@ from agents.tables import (
     DENSITY,
     METRICS,
     SPEED,
-    UnmeasuredError,
     error_label,
     format_interval,
-    grid,
-    markdown,
+    paired,
     pick,
+    table,
 )
 from dptse_env.evaluation import evaluate
 from dptse_env.rendering import History
@@ -196,39 +195,23 @@ class Curve(NamedTuple):
     field: str | None = None
 
 
-Played = Mapping[tuple[Any, ...], pl.DataFrame]
-"""Rows by the values of their labels."""
+def with_times(rows: pl.DataFrame, times: pl.DataFrame) -> pl.DataFrame:
+    """Return rows with the times of a step, where there are."""
+    keys = [*CELLS[0].labels, "traffic_seed"]
+    return rows.join(times.drop("version"), keys, "left", maintain_order="left")
 
 
-def by_cell(rows: pl.DataFrame, times: pl.DataFrame) -> Played:
-    """Return the rows of each cell, with times of a step where there are."""
-    names = list(CELLS[0].labels)
-    rows = rows.join(times.drop("version"), [*names, "traffic_seed"], "left", maintain_order="left")
-    cells = rows.partition_by(names, as_dict=True)
-    return {key: pick(found, dict(zip(names, key, strict=True))) for key, found in cells.items()}
-
-
-def curves_of(played: Played, setting: str, *wanted: Curve) -> list[FloatArray]:
+def curves_of(rows: pl.DataFrame, setting: str, *wanted: Curve) -> list[FloatArray]:
     """Return curves (n_points, n_seeds), paired by traffic seed.
 
     Raises:
-        UnmeasuredError: A cell was not played, or not with the numbers and on the seeds of the
-            rest.
+        UnmeasuredError: A cell was not played, or not with the numbers of the rest.
     """
-    found: list[list[FloatArray]] = []
-    origins = set()
-    for estimator, metric, field in wanted:
-        found.append([])
-        for labels in labels_along(field, estimator, setting):
-            rows = played.get(tuple(labels.values()))
-            if rows is None:
-                raise UnmeasuredError(labels)
-            rows = rows.drop_nulls(metric)
-            origins.add((*rows["version"].head(1), *rows["traffic_seed"]))
-            found[-1].append(rows[metric].to_numpy())
-    if len(origins) > 1 or len(found[0][0]) < 2:
-        raise UnmeasuredError(wanted)
-    return [np.array(points) for points in found]
+    rows = rows.drop_nulls({curve.metric for curve in wanted})
+    groups = [
+        (metric, labels_along(field, estimator, setting)) for estimator, metric, field in wanted
+    ]
+    return paired(rows, *groups)
 
 
 class Statistic(NamedTuple):
@@ -387,15 +370,16 @@ def judge(interval: Interval, low: float, high: float) -> str:
     return FAILS if interval.high < low or interval.low > high else OPEN
 
 
-def tables_of(played: Played) -> str:
+def tables_of(rows: pl.DataFrame) -> str:
     """Return the verdicts, the errors and times at the base point, and each claim in numbers."""
 
-    def table(corner: str, lines: Mapping[str, Any], entry: Callable[[Any, str], str]) -> str:
-        return grid(corner, list(lines), list(SETTINGS), lambda name, k: entry(lines[name], k))
+    def by_setting(corner: str, lines: Mapping[str, Any], entry: Callable[..., str]) -> str:
+        columns = {setting: partial(entry, setting=setting) for setting in SETTINGS}
+        return table(corner, lines, columns)
 
     @cache
     def measure(statistic: Statistic, part: Part, setting: str) -> Interval:
-        return statistic.measure(*curves_of(played, setting, *part))
+        return statistic.measure(*curves_of(rows, setting, *part))
 
     def verdict_of(claim: Claim, part: Part, setting: str) -> str:
         return judge(measure(claim.statistic, part, setting), claim.low, claim.high)
@@ -424,45 +408,38 @@ def tables_of(played: Played) -> str:
     text = [
         "# The paper's results",
         "## Claims of the paper, and how many of their parts hold",
-        table("claim", {claim.statement: claim for claim in CLAIMS}, verdict),
+        by_setting("claim", {claim.statement: claim for claim in CLAIMS}, verdict),
     ]
     for metric, (name, unit) in METRICS.items():
         text += [
             f"## RMSE of {name} [{unit}], and by how much it exceeds the random walk's",
-            table("estimator", names, partial(error, metric)),
+            by_setting("estimator", names, partial(error, metric)),
         ]
-    text += ["## Time of a step [ms]", table("estimator", names, milliseconds)]
-    lost = {"n_diverged": "started anew [s]", "n_fallback": "without an update [s]"}
-    counts = pl.concat(played.values()).group_by("estimator").agg(pl.col(*lost).sum(), pl.len())
-    text += [
-        "## What estimators lost",
-        markdown(
-            ["estimator", *lost.values(), "episodes"],
-            [[LABELS[name], *(f"{n:.0f}" for n in rest)] for name, *rest in sorted(counts.rows())],
-        ),
-        "## Each claim in numbers: ✓ holds, ✗ does not hold, ? undecided",
-    ]
+    text += ["## Time of a step [ms]", by_setting("estimator", names, milliseconds)]
+    text.append("## Each claim in numbers: ✓ holds, ✗ does not hold, ? undecided")
     for claim in CLAIMS:
         text += [
             f"### {claim.statement}",
             f"{claim.statistic.quantity}, in ({claim.low:g}, {claim.high:g})",
-            table("part", {name_of(part): part for part in claim.parts}, partial(number, claim)),
+            by_setting(
+                "part", {name_of(each): each for each in claim.parts}, partial(number, claim)
+            ),
         ]
     return "\n\n".join(text)
 
 
-def draw_sweep(played: Played, field: str, metrics: Sequence[str], columns: int) -> Figure:
+def draw_sweep(rows: pl.DataFrame, field: str, metrics: Sequence[str], columns: int) -> Figure:
     """Draw errors along a sweep, a panel for each metric and setting."""
     panels = list(itertools.product(metrics, SETTINGS))
     n_rows = len(panels) // columns
     figure = make_figure(2.0 * columns + 4.4, 2.7 * n_rows + 0.8, DPI)
     for axis, panel in zip(figure.subplots(n_rows, columns).flat, panels, strict=True):
         metric, setting = panel
-        (alone,) = curves_of(played, setting, Curve("open_loop", metric))
+        (alone,) = curves_of(rows, setting, Curve("open_loop", metric))
         lines = (*setting.split(", "), error_label(metric), f"open loop: {alone.mean():.1f}")
         axis.set_title("\n".join(lines), fontsize=8, loc="left")
         for k, name in enumerate(ESTIMATORS[:-1]):
-            (curve,) = curves_of(played, setting, Curve(name, metric, field))
+            (curve,) = curves_of(rows, setting, Curve(name, metric, field))
             places = shifted(SWEEPS[field], 0.01 * (k - 2), log=field != "bandwidth")
             means = [mean_interval(values) for values in curve]
             draw_curve(axis, places, means, ESTIMATOR_LOOKS[name], LABELS[name])
@@ -495,14 +472,14 @@ def draw_space_time(table: pl.DataFrame) -> Figure:
     return draw_maps(columns, width=10.4, height=0.7, dpi=90)
 
 
-def draw_times(played: Played) -> Figure:
+def draw_times(rows: pl.DataFrame) -> Figure:
     """Draw the time of a step beside the paper's."""
     figure = make_figure(6.4, 3.9, DPI)
     axis = figure.subplots()
     places = np.arange(len(ESTIMATORS))
     for k, setting in enumerate(SETTINGS):
         times = [
-            TIME.measure(*curves_of(played, setting, Curve(name, SECONDS))) for name in ESTIMATORS
+            TIME.measure(*curves_of(rows, setting, Curve(name, SECONDS))) for name in ESTIMATORS
         ]
         look = Look(COLOURS[k], "o", "none")
         draw_curve(axis, places + 0.16 * (k - 1.5), times, look, f"here, {setting}")
@@ -517,7 +494,7 @@ def draw_times(played: Played) -> Figure:
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return the tables, and draw the figures."""
-    played = by_cell(rows, read_table(folder / RUN_TIME, (*CELLS[0].labels, SECONDS)))
+    rows = with_times(rows, read_table(folder / RUN_TIME, (*CELLS[0].labels, SECONDS)))
     maps = read_table(folder / SPACE_TIME, ("truth", "estimate"))
     for name, field, metrics, columns in (
         ("fig1_cv_segments.png", "bandwidth", (DENSITY, SPEED), 4),
@@ -526,12 +503,12 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     ):
         fixed = ", ".join(f"{AXES[key]} = {BASE[key]:g}" for key in AXES if key != field)
         title = f"Error against {AXES[field]}; {fixed}"
-        save_measured(folder / name, title, draw_sweep, played, field, metrics, columns)
+        save_measured(folder / name, title, draw_sweep, rows, field, metrics, columns)
     title = f"Density, and estimates from {MAP_SEGMENTS} CV segments with their RMSE [veh/km]"
     save_measured(folder / "fig2_space_time.png", title, draw_space_time, maps)
     title = "Time of predict, update and estimate, one episode at a time"
-    save_measured(folder / "fig5_run_time.png", title, draw_times, played)
-    return tables_of(played)
+    save_measured(folder / "fig5_run_time.png", title, draw_times, rows)
+    return tables_of(rows)
 
 
 STUDY = Study(

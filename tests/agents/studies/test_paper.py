@@ -8,7 +8,7 @@ import pytest
 from agents.executors import this_process
 from agents.statistics import Interval
 from agents.studies import paper
-from agents.studies.paper import CELLS, SETTINGS, STUDY, by_cell, judge, tables_of
+from agents.studies.paper import CELLS, SETTINGS, STUDY, judge, tables_of, with_times
 from agents.study import Place, read_rows, read_table, run
 from agents.tables import format_interval, mean
 
@@ -32,7 +32,7 @@ def entries(text, first):
 
 
 def test_tables_have_the_means_of_the_rows(rows, times):
-    text = tables_of(by_cell(rows, times))
+    text = tables_of(with_times(rows, times))
     for entry, setting in zip(entries(text, "UKF"), SETTINGS, strict=True):
         density = mean(rows, paper.labels_of("ukf", setting), "rmse_density")
         assert entry.startswith(format_interval(density))
@@ -55,7 +55,7 @@ def test_a_verdict_follows_what_was_measured(
         times = times.with_columns(pl.col(column) * changed)
     else:
         rows = rows.with_columns(pl.col(column) * changed)
-    assert entries(tables_of(by_cell(rows, times)), claim) == [verdict] * 4
+    assert entries(tables_of(with_times(rows, times)), claim) == [verdict] * 4
 
 
 @pytest.mark.parametrize("how", ["lacking", "of another version"])
@@ -63,7 +63,7 @@ def test_what_cannot_be_compared_is_a_dash(rows, times, how):
     mhe = (pl.col("estimator") == "mhe") & (pl.col("privacy") == "printed")
     version = pl.when(mhe).then(pl.lit("0.0.0")).otherwise("version")
     rows = rows.filter(~mhe) if how == "lacking" else rows.with_columns(version=version)
-    text = tables_of(by_cell(rows, times.clear()))
+    text = tables_of(with_times(rows, times.clear()))
     assert entries(text, "P10.") == ["-", "-", *["does not hold (0 of 2)"] * 2]
     assert entries(text, "P16.")[3] == "holds (4 of 4)"
     assert entries(text, "P20.") == ["-"] * 4
