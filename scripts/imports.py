@@ -46,8 +46,6 @@ from scripts.cli import Command, Environment, Output, Replacing
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
 POLICY = f"policy{SUFFIX}"
-Shares = tuple[float, float, float]
-SHARES: Shares = (0.6, 0.2, 0.2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +72,7 @@ class RoadImport(Import):
 
     def tell_road(
         self, found: Mapping[str, Any], said: Iterable[str], seeds: Mapping[str, Sequence[int]],
-        corridor: Corridor, env: str, keywords: Mapping[str, Any], *fit: str,
+        corridor: Corridor, env: str, keywords: Mapping[str, Any],
     ) -> None:  # fmt: skip
         """Print what was imported, and the commands that come next, with the traffic seeds.
 
@@ -85,9 +83,8 @@ class RoadImport(Import):
             corridor: The road.
             env: Id of an environment.
             keywords: Its keywords.
-            fit: Options of the command that fits the road.
         """
-        said, commands = [*said], []
+        said, commands = [*said], list[tuple[str, ...]]()
         if missing := [kind for kind in KINDS if not seeds[kind]]:
             most = corridor.conditions.duration
             said.append(
@@ -95,7 +92,7 @@ class RoadImport(Import):
                 f"duration below {most} s, more files or other shares make some"
             )
         else:
-            commands.append(("fit", self.road_file.as_posix(), *fit))
+            commands.append(("fit", self.road_file.as_posix()))
         if seeds["test"]:
             first, last = seeds["test"][0], seeds["test"][-1]
             few = {"bandwidth": min(2, corridor.geometry.n_mainline)}
@@ -106,7 +103,21 @@ class RoadImport(Import):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trajectories(Environment, RoadImport):
+class WindowImport(RoadImport):
+    """What the imports of what was measured have."""
+
+    shares: tuple[float, float, float] = (0.6, 0.2, 0.2)
+    """Shares of the windows for training, validation and test, in this order of time."""
+
+    @property
+    def splits(self) -> list[Split]:
+        """The parts of the windows."""
+        parts = zip(KINDS.items(), self.shares, strict=True)
+        return [Split(kind, share, seeds) for (kind, seeds), share in parts]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectories(Environment, WindowImport):
     r"""Import recorded trajectories as records of a road.
 
     dptse import trajectories --files points.csv --format table \
@@ -129,8 +140,6 @@ class Trajectories(Environment, RoadImport):
     """Units by quantity, as quantity=unit: time, length, speed."""
     where: tuple[str, ...] = ()
     """Values that columns must have, as column=value."""
-    shares: Shares = SHARES
-    """Shares of the windows for training, validation and test, in this order of time."""
     options: Annotated[Options, arg(name="")] = Options()  # noqa: RUF009 (frozen)
 
     def run(self) -> None:
@@ -143,7 +152,7 @@ class Trajectories(Environment, RoadImport):
             self.source(),
             self.corridor(),
             self.output,
-            splits(self.shares),
+            self.splits,
             self.options,
             {key: value for key, value in environment.items() if key != "traffic_seeds"},
         )
@@ -175,7 +184,7 @@ class Trajectories(Environment, RoadImport):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Field(RoadImport):
+class Field(WindowImport):
     r"""Import a measured field of density and speed, or flow.
 
     dptse import field --density density.txt --speed speed.txt \
@@ -190,20 +199,16 @@ class Field(RoadImport):
     road: Annotated[FieldRoad, arg(name="")]
     duration: int = 450
     """Seconds of each of the windows that the field is cut into."""
-    shares: Shares = SHARES
-    """Shares of the windows for training, validation and test, in this order of time."""
 
     def run(self) -> None:
         """Import, and print the traffic seeds that there are and what to do next."""
         corridor, seeds = import_field(
-            self.source, self.road, self.output, splits(self.shares), self.duration
+            self.source, self.road, self.output, self.splits, self.duration
         )
         length = corridor.geometry.segment_lengths[0]
         found = {"seeds": seeds, "segment_length": length}
         said = *windows(seeds), f"road: {self.road_file}, segments of {length:g} km"
-        env, keywords = PAPER, {"privacy": "corrected"}
-        fit = "--env", f"{env} {json.dumps(keywords)}"
-        self.tell_road(found, said, seeds, corridor, env, keywords, *fit)
+        self.tell_road(found, said, seeds, corridor, PAPER, {"privacy": "corrected"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,10 +282,7 @@ class Network(RoadImport, Replacing):
         self.output.mkdir(parents=True, exist_ok=True)
         write_corridor(self.road_file, road.corridor, comment="\n".join(description))
         said = *description, f"road: {self.road_file}"
-        seeds, keywords = (
-            {kind: each[:8] for kind, each in KINDS.items()},
-            {"parameters": PARAMETERS},
-        )
+        seeds, keywords = {**KINDS, "test": KINDS["test"][:8]}, {"parameters": PARAMETERS}
         self.tell_road({"notes": road.remarks}, said, seeds, road.corridor, PAPER, keywords)
 
     def _files(self) -> Files:
@@ -347,13 +349,6 @@ Args = Trajectories | Network | Field | Policy
 def main(args: Args) -> None:
     """Import."""
     args.run()
-
-
-def splits(shares: Iterable[float]) -> list[Split]:
-    """Return the parts of the windows."""
-    return [
-        Split(name, share, each) for (name, each), share in zip(KINDS.items(), shares, strict=True)
-    ]
 
 
 def windows(seeds: Mapping[str, Sequence[int]]) -> list[str]:
