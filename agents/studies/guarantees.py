@@ -151,19 +151,7 @@ QUERIES: dict[str, dict[str, Any]] = {
 """Queries of a second; a sum is over neighbouring segments."""
 SAME_COST = ("5 segments", "5 sums of 2")
 FILTERS = ("ekf-demand", "ukf-demand", "enkf-demand", "mhe-demand", "random_walk")
-SCHEDULES = (
-    "static", "shift-ahead", "round-robin", "random", "oldest-first", "largest-variance",
-    "stale-variance", "greedy-trace",
-)  # fmt: skip
 CURVE = (0.5, 1.0, 2.0, 5.0, 10.0)
-PACES = (0.6, 0.7, 0.8, 0.85, 0.9, 1.0)
-VARIED = {
-    ("pace", DELTA): PACES,
-    ("pace", STRICT): PACES,
-    ("clip", DELTA): (18.0, 25.0, 35.0, 51.0, 102.0),
-    ("ratio", DELTA): (0.25, 0.5, 1.0),
-}
-"""Values of the settings of ``paced``, by delta."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "a trip, replaced": {},
     "added or removed": {"adjacency": "add_remove"},
@@ -338,13 +326,6 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
         for queries, each in product(SAME_COST, FILTERS)
     }
     yield compared(ask, "EKF", filters, REFUSED)
-    yield "## Settings, `paced`"
-    settings = {
-        f"{name} {value:g}, δ = {delta:g}": (paid(**{name: value}, delta=delta), paid(delta=delta))
-        for (name, delta), values in VARIED.items()
-        for value in values
-    }
-    yield compared(ask, "base", settings, REFUSED)
     capped = partial(paid, **CAPPED)
     lines: dict[str, Line] = {}
     for column, name in (ERRORS | {REFUSED: REFUSED}).items():
@@ -356,8 +337,6 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
         yield sweep(ask, "", along(CURVE, delta=delta), lines)
     yield "## What is protected"
     yield sweep(ask, "", VARIANTS, lines)
-    yield "## Schedules"
-    yield sweep(ask, "", {f"`{name}`": {"schedule": name} for name in SCHEDULES}, lines)
 
 
 def all_cells() -> tuple[Cell, ...]:
@@ -549,13 +528,6 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     rows = rows.with_columns((100.0 * pl.col("n_refused") / met).alias(REFUSED))
     for name, (draw, title) in FIGURES.items():
         save_measured(folder / name, title, draw, rows)
-    lost = rows.group_by("part", "estimator").agg(
-        pl.len().alias("episodes"),
-        pl.col("n_diverged").sum().cast(int).alias("started over [s]"),
-        pl.col("n_fallback").sum().cast(int).alias("kept the prediction [s]"),
-        pl.col("n_dropped").sum().cast(int).alias("dropped requests"),
-    )
-    lost = lost.sort("part", "estimator")
     ask = partial(cell, number, rows)
     return "\n\n".join(
         [
@@ -570,8 +542,6 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
             *ledger_tables(ask),
             "## Equal density errors",
             equal_errors(rows),
-            "# What estimators lost",
-            markdown(lost.columns, [list(map(str, line)) for line in lost.iter_rows()]),
         ]
     )
 
