@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
@@ -26,8 +26,6 @@ from dptse_env.utils.files import replacing
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666")
 """Okabe and Ito's, which the colour-blind can tell apart, and a grey."""
-PALE = "#a8cbe2"
-"""Bars of what is compared with."""
 WIDTH = 7.2
 """Largest width of a figure [inches]: its texts of 8 points are read at 700 pixels."""
 INK, GREY, GRID_COLOUR = "#1b2a41", "#333333", "#e3e6ea"
@@ -46,7 +44,8 @@ def make_figure(width: float, height: float, dpi: int = 140) -> Figure:
 
 def save_figure(figure: Figure, path: Path, title: str) -> None:
     """Give a figure its title and save it as PNG, without pyplot and its global state."""
-    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+    folded = fill(title, int(13 * figure.get_figwidth()))
+    figure.suptitle(folded, x=0.01, ha="left", fontsize=10)
     path.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
@@ -106,13 +105,11 @@ def spread(intervals: Sequence[Interval]) -> FloatArray:
     return np.array([[each.mean - each.low, each.high - each.mean] for each in intervals]).T
 
 
-def draw_dot(
-    axis: Axes, interval: Interval, place: float, colour: str, label: str, fmt: str = "o"
-) -> None:
+def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: str) -> None:
     """Draw a mean with its interval at a height, and its value beside it."""
     axis.errorbar(
         [interval.mean], [place], xerr=spread([interval]), color=colour, label=label,
-        fmt=fmt, markersize=4, capsize=2.5, linewidth=1.2,
+        fmt="o", markersize=4, capsize=2.5, linewidth=1.2,
     )  # fmt: skip
     axis.annotate(
         f"{interval.mean:.1f}", (interval.high, place), color=colour,
@@ -134,7 +131,9 @@ def draw_errors(
     """
     most = max(sum(row in each for each in series.values()) for row in rows)
     panels = list(next(each[row] for each in series.values() for row in rows if row in each))
-    figure, axes = _make_panels(rows, panels, 0.18 + 0.12 * most)
+    figure = make_figure(WIDTH, 1.1 + (0.18 + 0.12 * most) * len(rows), dpi=160)
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    axes[0].set_yticks([-place for place in range(len(rows))], rows)
     colours = dict(zip(series, cycle(COLOURS), strict=False))
     for axis, panel in zip(axes, panels, strict=True):
         for place, row in enumerate(rows):
@@ -142,44 +141,14 @@ def draw_errors(
             for k, (name, interval) in enumerate(own.items()):
                 shift = ((len(own) - 1) / 2 - k) * 0.3
                 draw_dot(axis, interval, shift - place, colours[name], name)
+        axis.set_xlabel(fill(panel, 72 // len(panels)), fontsize=9)
         if log:
             axis.set_xscale("log")
             set_log_ticks(axis.xaxis, ERROR_TICKS)
         axis.margins(x=0.2)
+        add_frame(axis, "x")
     add_legend(figure, axes[:1])
     return figure
-
-
-def draw_bars(errors: Mapping[str, Mapping[str, Interval]], lit: Collection[str]) -> Figure:
-    """Draw bars with 95 % intervals, a panel for each of some errors.
-
-    Args:
-        errors: By row, from top to bottom, and error, the same errors for all: intervals.
-        lit: Rows that stand out.
-    """
-    panels = list(next(iter(errors.values())))
-    figure, axes = _make_panels(list(errors), panels, 0.24)
-    for axis, panel in zip(axes, panels, strict=True):
-        for place, (row, own) in enumerate(errors.items()):
-            interval = own[panel]
-            colour = COLOURS[1] if row in lit else PALE
-            axis.barh(-place, interval.mean, height=0.72, color=colour)
-            draw_dot(axis, interval, -place, INK, "", fmt="none")
-        axis.set_xlim(0.0, 1.3 * max(own[panel].high for own in errors.values()))
-    return figure
-
-
-def _make_panels(
-    rows: Sequence[str], panels: Sequence[str], height: float
-) -> tuple[Figure, Sequence[Axes]]:
-    """Return a figure with a panel for each error, and rows of a height [inches]."""
-    figure = make_figure(WIDTH, 1.1 + height * len(rows), dpi=160)
-    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axis, panel in zip(axes, panels, strict=True):
-        axis.set_xlabel(fill(panel, 72 // len(panels)), fontsize=9)
-        add_frame(axis, "x")
-    axes[0].set_yticks([-place for place in range(len(rows))], rows)
-    return figure, axes
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ import numpy as np
 import polars as pl
 
 from agents.environments import heading, make_config, parse_env
-from agents.figures import RoadMap, draw_bars, draw_errors, draw_maps, estimate_map, save_figure
+from agents.figures import RoadMap, draw_errors, draw_maps, estimate_map, save_figure
 from agents.files import write_json
 from agents.page import watch, write_page
 from agents.play import Cell
@@ -319,15 +319,16 @@ def _kinds(scores: Sequence[Score], cells: Sequence[Cell]) -> tuple[list[Score],
 
 
 def draw_scores(path: Path, title: str, scores: Sequence[Score], cells: Sequence[Cell]) -> None:
-    """Draw the errors of all policies."""
+    """Draw the errors of all policies, with a colour for each estimator, or kind of policy."""
     series: dict[str, dict[str, dict[str, Interval]]] = {}
-    for each in scores:
-        shown = {error_label(metric): each.means[metric] for metric in METRICS}
-        series.setdefault(each.estimator, {})[each.policy] = shown
-    first, *others = series.values()
     learned, _ = _kinds(scores, cells)
-    lit = [each.policy for each in learned]
-    save_figure(draw_errors(list(first), series) if others else draw_bars(first, lit), path, title)
+    one = len({each.estimator for each in scores}) == 1
+    for each in scores:
+        kind = each.estimator if not one else "learned" if each in learned else "rule"
+        shown = {error_label(metric): each.means[metric] for metric in METRICS}
+        series.setdefault(kind, {})[each.policy] = shown
+    policies = list(dict.fromkeys(each.policy for each in scores))
+    save_figure(draw_errors(policies, series, log=not one), path, title)
 
 
 def draw_traffic(args: Args, title: str, scores: Sequence[Score], cells: Sequence[Cell]) -> None:
@@ -353,11 +354,8 @@ def draw_traffic(args: Args, title: str, scores: Sequence[Score], cells: Sequenc
     figure = draw_maps([maps], width=8.4)
     save_figure(figure, args.output / MAPS, f"{title}: seed {seed}, {own[0].estimator}")
     if args.html:
-        errors = [
-            (each.policy, {m: (each.means[m].mean, each.means[m].half_width) for m in METRICS})
-            for each in own
-        ]
-        write_page(args.output / PAGE, title, errors, episodes, seed)
+        table = make_rows(own, args.reference)
+        write_page(args.output / PAGE, title, *table, episodes, seed)
 
 
 # The suite.

@@ -21,7 +21,7 @@ from matplotlib.patches import FancyBboxPatch
 from PIL import Image
 
 from agents.environments import make_config
-from agents.figures import COLOURS, INK, PALE, add_frame
+from agents.figures import COLOURS, INK, add_frame
 from agents.page import watch
 from agents.play import Cell
 from dptse_env.rendering import History
@@ -38,7 +38,7 @@ SEED, STILL = 2009, 284
 SECONDS = range(120, 500, 4)
 FRAME = 110  # milliseconds
 SHADES = "YlOrRd"  # pale is empty, dark red a jam
-NOW, EARLIER, IDLE = COLOURS[0], PALE, "#eef1f5"  # when a segment was queried
+NOW, EARLIER, IDLE = COLOURS[0], "#a8cbe2", "#eef1f5"  # when a segment was queried
 TRUTH, QUERIES, ESTIMATE = 2.2, 1.25, 0.0  # heights of the strips
 STRIPS = {
     TRUTH: ("traffic", "as it is"),

@@ -12,7 +12,6 @@ from agents import terminal
 from agents.figures import (
     WIDTH,
     RoadMap,
-    draw_bars,
     draw_errors,
     draw_maps,
     estimate_map,
@@ -109,35 +108,21 @@ def test_errors_of_every_policy_are_drawn_from_top_to_bottom():
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ekf", "ukf"]
 
 
-def test_bars_begin_at_zero_and_those_of_learned_policies_stand_out():
-    errors = {
-        name: {"density": Interval(mean, mean - 1.0, mean + 1.0, 3)}
-        for name, mean in (("mine", 8.0), ("shift-ahead", 10.0))
-    }
-    (axis,) = draw_bars(errors, ["mine"]).axes
-    mine, other = axis.patches
-    assert (mine.get_width(), other.get_width()) == (8.0, 10.0)
-    assert mine.get_facecolor() != other.get_facecolor()
-    assert axis.get_xlim()[0] == 0.0
-    assert axis.get_xlim()[1] > 11.0
-    assert mine.get_y() > other.get_y()
-
-
 def test_a_wide_figure_is_made_as_narrow_as_a_page():
     assert make_figure(4.0, 3.0).get_size_inches().tolist() == [4.0, 3.0]
     assert make_figure(2.0 * WIDTH, 3.0).get_size_inches().tolist() == [WIDTH, 0.8 * 3.0]
 
 
 def test_the_page_has_what_happened_and_needs_no_network(episode, tmp_path, monkeypatch):
-    errors = [("shift-ahead", {"rmse_density": (10.5, 1.0), "rmse_speed": (5.0, 0.5)})]
+    table = ("policy", "density RMSE\n[veh/km]"), [("shift-ahead", "10.5 ± 1.0")]
     path = tmp_path / "page.html"
-    write_page(path, "A title with <script>", errors, [episode], 0)
+    write_page(path, "A title with <script>", *table, [episode], 0)
     text = path.read_text("utf-8")
     assert '"label":"80"' in text
     assert "src=" not in text.replace("src=null", "").split("<body>")[0]
     assert text.count("<script src") == 0
     assert "title with <script>" not in text
-    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    monkeypatch.setitem(sys.modules, "plotly.subplots", None)
     with pytest.raises(ImportError, match=r"pip install 'dptse-env\[train\]'"):
-        write_page(tmp_path / "other.html", "title", errors, [episode], 0)
+        write_page(tmp_path / "other.html", "title", *table, [episode], 0)
     assert list(tmp_path.iterdir()) == [path]
