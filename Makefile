@@ -27,8 +27,8 @@ demo: setup  ## Train a query policy for a minute and compare it with rules on o
 	$(BIN)/dptse train $(DEMO) --minutes 1 --algorithm 'ppo {"validations": 8}' \
 		--train-seeds 0:48 --validation-seeds 1000:1016 --output results/demo/training
 	$(BIN)/dptse evaluate $(DEMO) --policies results/demo/training/best.safetensors \
-		--schedules random round-robin oldest-first stale-variance largest-density-variance speed-front \
-		--seeds 2000:2032 --reference speed-front --output results/demo --force
+		random round-robin oldest-first stale-variance largest-density-variance speed-front \
+		--test-seeds 2000:2032 --reference speed-front --output results/demo --force
 
 pictures: demo  ## Draw the pictures of the pages anew; docs/images.
 	$(BIN)/python docs/_site/pictures.py

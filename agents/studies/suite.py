@@ -141,14 +141,9 @@ def make_cell(name: str, policy: str, source: str) -> Cell:
     return replace(CELLS[name], policy=source, labels={"name": name, "policy": policy})
 
 
-def rule_cells() -> tuple[Cell, ...]:
-    """Return all cells with all schedules."""
-    return tuple(make_cell(name, each, each) for name, each in product(CELLS, (*RULES, *ORACLES)))
-
-
-def learned_cells() -> list[Cell]:
-    """Return all cells with all policies that come with the package, whether they fit or not."""
-    return [make_cell(name, each, each) for name, each in product(CELLS, shipped_policies())]
+def all_cells(policies: Sequence[str]) -> tuple[Cell, ...]:
+    """Return all cells with all of some policies, whether they fit or not."""
+    return tuple(make_cell(name, each, each) for name, each in product(CELLS, policies))
 
 
 def enter(policies: Sequence[str], names: Sequence[str]) -> tuple[tuple[Cell, ...], str]:
@@ -198,9 +193,8 @@ def recorded_rows() -> pl.DataFrame:
 
 def _present(rows: pl.DataFrame) -> pl.DataFrame:
     """Return the rows without those of weights and policies that came with the package before."""
-    return rows.filter(
-        pl.col("cell").is_in([each.id for each in (*rule_cells(), *learned_cells())])
-    )
+    cells = all_cells((*RULES, *ORACLES, *shipped_policies()))
+    return rows.filter(pl.col("cell").is_in([each.id for each in cells]))
 
 
 # Scores.
@@ -305,15 +299,27 @@ def best_rule(rows: pl.DataFrame, name: str) -> str:
 
 def beside_rules(rows: pl.DataFrame, policies: Sequence[str]) -> tuple[list[str], list[list[str]]]:
     """Return header and rows of a table of scores by cell, with the best rule and the room."""
-    scores = score_all(rows)
-    columns = {policy: format_scores(each) for policy, each in scores.items()}
-    best = [next(policy for policy in scores if policy in RULES)]
-    best += [best_rule(rows, name) for name in CELLS]
-    rules = [f"{rule} {columns[rule][place]}" for place, rule in enumerate(best)]
-    rooms = ["", *(f"{room(rows, name).mean:.1f} %" for name in CELLS)]
-    shown = [columns[policy] for policy in policies]
-    lines = zip(["mean", *CELLS], *shown, rules, rooms, strict=True)
-    return ["cell", *policies, "best rule", f"{ONE} below best rule"], [list(x) for x in lines]
+    names, scores = ("mean", *CELLS), score_all(rows)
+    columns = {
+        policy: dict(zip(names, format_scores(each), strict=True))
+        for policy, each in scores.items()
+    }
+
+    def best(name: str) -> str:
+        first = next(policy for policy in scores if policy in RULES)
+        rule = first if name == "mean" else best_rule(rows, name)
+        return f"{rule} {columns[rule][name]}"
+
+    lines = [
+        [
+            name,
+            *(columns[policy][name] for policy in policies),
+            cell(best, name),
+            cell(lambda name: tenths(room(rows, name)), name),
+        ]
+        for name in names
+    ]
+    return ["cell", *policies, "best rule", f"{ONE} below it [%]"], lines
 
 
 def room(rows: pl.DataFrame, name: str) -> Interval:
@@ -362,16 +368,13 @@ def make_card(rows: pl.DataFrame, policy: str, cells: Sequence[Cell]) -> dict[st
         "policies": played,
         "score": _plain(mean_score(list(scores.values()))) if everywhere else None,
         "scores": {name: _plain(mean_score([each])) for name, each in scores.items()},
-        "errors": {
-            name: {str(seed): -1000.0 * reward for seed, reward in _rewards(rows, policy, name)}
-            for name in scores
-        },
+        "errors": {name: _errors(rows.filter(policy=policy, name=name)) for name in scores},
     }
 
 
-def _rewards(rows: pl.DataFrame, policy: str, name: str) -> list[tuple[int, float]]:
-    own = rows.filter(policy=policy, name=name).sort("traffic_seed")
-    return list(own.select("traffic_seed", "reward").iter_rows())
+def _errors(rows: pl.DataFrame) -> dict[str, float]:
+    own = rows.sort("traffic_seed").select("traffic_seed", "reward")
+    return {str(seed): -1000.0 * reward for seed, reward in own.iter_rows()}
 
 
 def _plain(interval: Interval) -> dict[str, float]:
@@ -425,7 +428,7 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
             "## Scores",
             markdown(header, lines),
             "## What is to be won",
-            _room_table(rows),
+            markdown(*beside_rules(rows, ())),
             "## Errors x 1000",
             grid(
                 "policy",
@@ -437,28 +440,6 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
             _cell_table(),
         ]
     )
-
-
-def _room_table(rows: pl.DataFrame) -> str:
-    def error(policy: str, name: str) -> str:
-        return f"{mean(rows, _labels(policy, name), ERROR).mean:.1f}"
-
-    def best(name: str) -> str:
-        rule = best_rule(rows, name)
-        return f"{error(rule, name)} `{rule}`"
-
-    header = ["cell", ZERO, "best rule", ONE, "gain oracle below the best rule [%]"]
-    lines = [
-        [
-            f"`{name}`",
-            cell(error, ZERO, name),
-            cell(best, name),
-            cell(error, ONE, name),
-            cell(lambda name: tenths(room(rows, name)), name),
-        ]
-        for name in CELLS
-    ]
-    return markdown(header, lines)
 
 
 def _cell_table() -> str:
@@ -517,8 +498,10 @@ def draw_scores(scores: Scores, path: Path) -> None:
 
 STUDY = Study(
     "suite",
-    rule_cells(),
+    all_cells((*RULES, *ORACLES)),
     SEEDS,
     report,
-    follow=lambda rows, place: [each for each in learned_cells() if each.misfit() is None],
+    follow=lambda rows, place: [
+        each for each in all_cells(shipped_policies()) if each.misfit() is None
+    ],
 )

@@ -101,8 +101,9 @@ def on_other_roads(rows: pl.DataFrame) -> dict[str, Interval]:
 def on_measured_road() -> dict[str, Interval]:
     """Return errors on a measured road, whose field is not ours to ship, from the page on it."""
     page = (ROOT / "results" / "roads" / "README.md").read_text(encoding="utf-8")
-    found = re.findall(r"^\| `(\w+)`[^|]*\| \**([\d.]+)", page, re.MULTILINE)
-    return {name: Interval(*3 * (float(error),), 1) for name, error in found}
+    found = re.findall(r"^\| `(\w+)`[^|]*\| \**([\d.]+) ± ([\d.]+)", page, re.MULTILINE)
+    errors = ((name, float(error), float(half)) for name, error, half in found)
+    return {name: Interval(error, error - half, error + half, 5) for name, error, half in errors}
 
 
 def draw_epsilon() -> Figure:

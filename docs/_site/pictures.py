@@ -9,7 +9,7 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 SCRIPTS = ("episode.py", "two_worlds.py", "environment.py", "guides.py")
-BARS = FOLDER.parents[1] / "results" / "demo" / "schedules.png"
+BARS = FOLDER.parents[1] / "results" / "demo" / "errors.png"
 
 if __name__ == "__main__":
     for script in SCRIPTS:

@@ -80,7 +80,7 @@ def test_the_example_that_the_help_of_a_command_begins_with_can_be_parsed():
 
 
 def test_a_command_with_an_unknown_option_would_be_noticed():
-    for line in ("dptse record --test-sedes 2000:2004", "dptse evaluate --seeds"):
+    for line in ("dptse record --test-sedes 2000:2004", "dptse evaluate --test-seeds"):
         with pytest.raises(SystemExit) as ended:
             check(line)
         assert ended.value.code == 2

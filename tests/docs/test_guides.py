@@ -27,8 +27,8 @@ SEEDS = "--train-seeds 0:2 --validation-seeds 1000:1002 --test-seeds 2000:2002"
 GUIDES = {
     "train-a-policy.md": {
         "--minutes 8": "--steps 8192 --train-seeds 0:2 --validation-seeds 1000:1002",
-        "--seeds 2000:2032": "--seeds 2000:2002 --workers 1",
-        "dptse suite mine/best.safetensors": "dptse suite mine/best.safetensors --cells short",
+        "--test-seeds 2000:2032": "--test-seeds 2000:2002 --workers 1",
+        "dptse evaluate --suite": "dptse evaluate --suite short",
         '"0:64"': '"0:2"',
         "1_000_000": "8192",
         'num_envs=8, traffic_seeds="2000:2008"': 'num_envs=2, traffic_seeds="2000:2002"',
@@ -39,12 +39,12 @@ GUIDES = {
         "--steps 300000 --train-seeds 0:8 --validation-seeds 1000:1008": (
             "--steps 8192 --train-seeds 0:2 --validation-seeds 1000:1002"
         ),
-        "--seeds 2000:2016": "--seeds 2000:2002 --workers 1",
+        "--test-seeds 2000:2016": "--test-seeds 2000:2002 --workers 1",
     },
     "your-network.md": {"dptse fit town/road.toml": f"dptse fit town/road.toml {FIT} {SEEDS}"},
     "many-machines.md": {
         "--executor ray --address auto": "--executor local --workers 1",
-        "--seeds 2000:2032": "--seeds 2000:2002",
+        "--test-seeds 2000:2032": "--test-seeds 2000:2002",
         "dptse audit": "dptse audit --trials 100 --env dptse_env:dptse/ShortHighway-v0",
     },
     "audit.md": {"--trials 500": "--trials 100 --workers 1", "--one-run": "--one-run --workers 1"},

@@ -35,5 +35,5 @@ def test_the_page_says_of_the_estimators_what_their_picture_shows(code):
 
 def test_the_measured_road_has_the_errors_of_its_page(code):
     errors = {name: interval.mean for name, interval in code["on_measured_road"]().items()}
-    assert errors.keys() == {"random_walk", "blend", "ukf", "ekf", "asm", "recurrent"}
+    assert errors.keys() == {"random_walk", "blend", "ukf", "ekf", "enkf", "asm", "recurrent"}
     assert min(errors, key=errors.get) == "recurrent"

@@ -39,5 +39,5 @@ def test_the_commands_train_a_policy_that_beats_the_rules(tmp_path, monkeypatch)
             printed += done.stdout
     assert re.search(r"learned \(mine/best\).*: \d+\.\d % below, ", printed)
     assert all(
-        (tmp_path / "mine" / "test" / name).is_file() for name in ("tables.md", "schedules.png")
+        (tmp_path / "mine" / "test" / name).is_file() for name in ("tables.md", "errors.png")
     )

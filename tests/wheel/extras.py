@@ -27,7 +27,7 @@ WITH_TRAIN = {
     ],
     "ray": [
         ["suite", "static", "--executor", "ray"],
-        ["evaluate", "--executor", "ray", "--seeds", "2000:2002", "--output", "ladder"],
+        ["evaluate", "--executor", "ray", "--test-seeds", "2000:2002", "--output", "ladder"],
     ],
 }
 """Commands by the extra that they lack, where the extra `train` is installed."""

@@ -34,8 +34,8 @@ COMMANDS = [
         '"swaps": {"rounds": 1, "episodes": 2, "batches": 2}}',
     ],
     [
-        "evaluate", "--env", BRIEFLY, "--seeds", "2000:2002",
-        "--schedules", "round-robin", "--policies", "trained/policy.safetensors",
+        "evaluate", "--env", BRIEFLY, "--test-seeds", "2000:2002",
+        "--policies", "round-robin", "trained/policy.safetensors",
         "--estimators", "random_walk", "--output", "ladder",
     ],
 ]  # fmt: skip
