@@ -15,41 +15,33 @@ from dptse_env.tools import add_tools_path
 
 add_tools_path()
 
+from functools import partial
 from pathlib import Path
 
 import polars as pl
+from matplotlib.figure import Figure
 
-from agents.figures import (
-    ESTIMATOR_LOOKS,
-    draw_curve,
-    finish_figure,
-    make_figure,
-    save_figure,
-)
+from agents.figures import ESTIMATOR_LOOKS, draw_curve, finish_figure, make_figure, save_measured
 from agents.play import Cell
-from agents.statistics import Interval
 from agents.study import Place, Study, run
-from agents.tables import (
-    DENSITY,
-    METRICS,
-    UnmeasuredError,
-    below,
-    error_label,
-    format_interval,
-    grid,
-    mean,
-)
+from agents.tables import DENSITY, METRICS, below, error_label, format_interval, grid, mean
 
 ENV = "dptse_env:dptse/ShortHighway-v0"
 RULES = ("round-robin", "speed-front")
 BANDWIDTHS = (1, 2, 3)
+
+
+def labels(rule: str, bandwidth: int) -> dict[str, str | int]:
+    """Return the labels by which a cell is found again among the rows."""
+    return {"rule": rule, "bandwidth": bandwidth}
+
 
 CELLS = tuple(
     Cell(
         env=ENV,
         policy=rule,
         keywords={"bandwidth": bandwidth, "estimator": "ekf"},
-        labels={"rule": rule, "bandwidth": bandwidth},
+        labels=labels(rule, bandwidth),
     )
     for rule in RULES
     for bandwidth in BANDWIDTHS
@@ -59,40 +51,36 @@ CELLS = tuple(
 def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return the tables, and draw errors against the bandwidth."""
 
-    def error(rule: str, bandwidth: int, metric: str) -> Interval:
-        return mean(rows, {"rule": rule, "bandwidth": bandwidth}, metric)
+    def error(metric: str, rule: str, bandwidth: int) -> str:
+        return format_interval(mean(rows, labels(rule, bandwidth), metric))
 
     def gain(_: str, bandwidth: int) -> str:
-        new, old = ({"rule": rule, "bandwidth": bandwidth} for rule in reversed(RULES))
+        old, new = (labels(rule, bandwidth) for rule in RULES)
         return format_interval(below(rows, new, old))
 
     parts = []
-    for metric, (name, unit) in METRICS.items():
-        parts.append(f"## RMSE of {name} [{unit}]")
-        parts.append(
-            grid(
-                "rule",
-                RULES,
-                BANDWIDTHS,
-                lambda rule, b, metric=metric: format_interval(error(rule, b, metric)),
-            )
-        )
-    parts.append("## Error of speed-front below round-robin, paired [%]")
-    parts.append(grid("", ["gain"], BANDWIDTHS, gain))
+    for metric in METRICS:
+        parts += [
+            f"## {error_label(metric)}",
+            grid("rule", RULES, BANDWIDTHS, partial(error, metric)),
+        ]
+    parts += ["## Error of speed-front below round-robin, paired [%]"]
+    parts += [grid("", ["gain"], BANDWIDTHS, gain)]
+    save_measured(folder / "errors.png", "ShortHighway-v0, EKF", draw, rows)
+    return "\n\n".join(parts)
 
+
+def draw(rows: pl.DataFrame) -> Figure:
+    """Draw errors against the bandwidth."""
     figure = make_figure(5.0, 3.4)
     axis = figure.subplots()
     for rule, look in zip(RULES, ESTIMATOR_LOOKS.values(), strict=False):
-        try:
-            errors = [error(rule, bandwidth, DENSITY) for bandwidth in BANDWIDTHS]
-        except UnmeasuredError:
-            continue
+        errors = [mean(rows, labels(rule, bandwidth), DENSITY) for bandwidth in BANDWIDTHS]
         draw_curve(axis, BANDWIDTHS, errors, look, rule)
     axis.set_xticks(BANDWIDTHS)
     axis.set_xlabel("segments queried a second")
     axis.set_ylabel(error_label(DENSITY))
-    save_figure(finish_figure(figure), folder / "errors.png", "ShortHighway-v0, EKF")
-    return "\n\n".join(parts)
+    return finish_figure(figure)
 
 
 STUDY = Study("my-study", CELLS, tuple(range(2000, 2008)), report)

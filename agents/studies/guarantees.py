@@ -521,11 +521,9 @@ FIGURES = {
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return the tables, and draw the figures."""
-    # An interrupted run may have the rows, and so the columns, of one part alone.
-    names = {**priced("ekf").labels, **paid().labels, "n_met": 0, "n_refused": 0}
-    rows = rows.with_columns(pl.lit(None).alias(name) for name in names.keys() - {*rows.columns})
-    met = pl.col("n_met").cast(pl.Float64).clip(1.0)
-    rows = rows.with_columns((100.0 * pl.col("n_refused") / met).alias(REFUSED))
+    if "n_met" in rows.columns:  # an interrupted run may have the rows of one part alone
+        met = pl.col("n_met").cast(pl.Float64).clip(1.0)
+        rows = rows.with_columns((100.0 * pl.col("n_refused") / met).alias(REFUSED))
     for name, (draw, title) in FIGURES.items():
         save_measured(folder / name, title, draw, rows)
     ask = partial(cell, number, rows)

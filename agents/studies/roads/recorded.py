@@ -13,9 +13,9 @@ from pathlib import Path
 from filelock import FileLock
 
 from agents.filters import highways
-from agents.filters.highways import SLOW, Section
+from agents.filters.highways import Section
 from dptse_env.importers.folder import ROAD, new_folder
-from dptse_env.traffic import Corridor, Record, RecordLibrary, read_corridor, write_corridor
+from dptse_env.traffic import Corridor, RecordLibrary, read_corridor, write_corridor
 from dptse_env.traffic.imported import load_record, save_records
 from dptse_env.traffic.library import CACHE_VARIABLE, default_path
 from dptse_env.utils.files import file_digest, require_writable
@@ -31,12 +31,11 @@ QUEUES: dict[str, tuple[int, ...]] = {
         10000, 10017, 10021, 10022, 10023, 10027, 10028, 10035, 10043, 10046,
     ),
 }  # fmt: skip
-"""Numbers of highways whose sections are played, by where they have a queue, as `queue_of` finds
-it. Weights are trained on highways of smaller numbers."""
-SEGMENTS, SECONDS = 9, 400
-"""Segments of a section, and seconds of its record."""
-QUEUED, RARELY = 0.15, 0.02
-"""Shares of the seconds in which a segment with a queue, and one without, is slow."""
+"""Numbers of highways whose sections are played, by where they have a queue.
+
+A segment with a queue is slow in 15 % of the seconds or more, others at the end and all where there
+is no queue in less than 2 %. Weights are trained on highways of smaller numbers.
+"""
 
 
 def __getattr__(name: str) -> Callable[[], Corridor]:
@@ -63,20 +62,8 @@ def section(number: int) -> Corridor:
 
 def _write_section(number: int, folder: Path) -> None:
     with tempfile.TemporaryDirectory() as work:
-        cut = Section(number, SEGMENTS, windows=1, seconds=SECONDS)
+        cut = Section(number, segments=9, windows=1, seconds=400)
         road = read_corridor(cut.write(Path(work), RecordLibrary()))
         record = load_record(road, 0)
     kept = save_records(folder, road, [record], [{"seed": number}])
     write_corridor(folder / ROAD, road.replaced(recordings=kept))
-
-
-def queue_of(road: Corridor, record: Record) -> str | None:
-    """Return where a section has a queue, one of `QUEUES`; None where that is not clear."""
-    lengths, limits = road.road.lengths, road.road.limits
-    slow = (record.traffic(lengths, limits)[..., 1] < SLOW * limits).mean(axis=0)
-    mainline, (start, end) = slow[: road.geometry.n_mainline], slow[road.geometry.n_segments :][:2]
-    if min(mainline[-1], end) > QUEUED:
-        return "queue through the end"
-    if mainline.max() > QUEUED and end < RARELY:
-        return "queue inside"
-    return "no queue" if max(*mainline, start, end) < RARELY else None

@@ -1,17 +1,17 @@
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from agents.environments import make_config, quietly
+from agents.filters.highways import SLOW
 from agents.studies import roads
 from agents.studies.roads import on_road, recorded
 from agents.study import read_rows
 from agents.tables import pick
 from dptse_env.estimators import recurrent
 from dptse_env.importers.folder import ROAD
-from dptse_env.traffic import CORRIDORS, Record, write_corridor
+from dptse_env.traffic import CORRIDORS, write_corridor
 from dptse_env.traffic.imported import load_record
 
 RECORDED = Path(__file__).parents[3] / "results" / "roads"
@@ -91,32 +91,23 @@ def test_the_summary_is_the_mean_over_own_roads_that_were_played(rows):
     assert "over 1 own roads" in said
 
 
-def test_a_queue_through_the_end_is_told_from_one_inside():
-    road = CORRIDORS.find("paper-highway")
-    last, end = road.geometry.n_mainline - 1, road.geometry.n_segments + 1
-    speeds = np.full((40, len(road.road.lengths)), 90.0)
-
-    def queue(*columns):
-        slow = speeds.copy()
-        slow[:10, columns] = 20.0
-        return recorded.queue_of(road, field(np.full_like(slow, 30.0), slow))
-
-    def field(*both):
-        n_steps, n_columns = speeds.shape
-        return Record(n_steps=n_steps, n_columns=n_columns, field=np.stack(both, axis=-1))
-
-    assert queue(last, end) == "queue through the end"
-    assert queue(4, 5) == "queue inside"
-    assert queue() == "no queue"
-    assert queue(end) is queue(4, end) is None  # not on the section's last segment
+def queue_of(road, record):
+    """Return where a section has a queue; None where that is not clear."""
+    lengths, limits = road.road.lengths, road.road.limits
+    slow = (record.traffic(lengths, limits)[..., 1] < SLOW * limits).mean(axis=0)
+    mainline, (start, end) = slow[: road.geometry.n_mainline], slow[road.geometry.n_segments :][:2]
+    if min(mainline[-1], end) > 0.15:
+        return "queue through the end"
+    if mainline.max() > 0.15 and end < 0.02:
+        return "queue inside"
+    return "no queue" if max(*mainline, start, end) < 0.02 else None
 
 
 @pytest.mark.slow
 def test_sections_are_as_they_are_called():
     for queue, numbers in recorded.QUEUES.items():
         road = CORRIDORS.find(f"agents.studies.roads.recorded:section_{numbers[1]}")()
-        record = load_record(road, numbers[1])
-        assert recorded.queue_of(road, record) == queue
+        assert queue_of(road, load_record(road, numbers[1])) == queue
 
 
 def test_a_section_is_made_once_in_one_piece(tmp_path, monkeypatch):
