@@ -25,7 +25,7 @@ import loky
 from dptse_env.tools import add_tools_path
 from dptse_env.traffic.recording import follow_parent, uninterrupted
 from dptse_env.utils.kernels import compiling_is_said
-from dptse_env.utils.progress import make_bar
+from dptse_env.utils.progress import make_bar, set_quiet
 from dptse_env.utils.registry import needed_for
 from dptse_env.utils.validation import integer
 
@@ -156,6 +156,7 @@ def _begin(parent: int, is_said: bool) -> None:
     if is_said:
         compiling_is_said.set()
     warnings.filterwarnings("ignore", category=UserWarning, module="dptse_env")
+    set_quiet(True)  # bars are the parent's
     # In a terminal a bar of the parent stands in the line.
     start = "\r\033[K" if sys.stderr.isatty() else ""
     logging.basicConfig(format=f"{start}%(message)s")

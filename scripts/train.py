@@ -11,9 +11,7 @@ rounds comes to the same numbers.
 
 from __future__ import annotations
 
-import contextlib
 import shlex
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +19,11 @@ from typing import Any
 import torch
 
 from agents.environments import make_config, parse_env
-from agents.training.run import BEST, RULES_FILE, least
-from agents.training.run_files import Row, check_plan, read_progress
+from agents.training.run import BEST, RULES_FILE, best_rule, least
+from agents.training.run_files import check_plan, read_progress
 from agents.training.settings import PlackettLuceSettings, TrainingPlan, parse_algorithm
 from agents.training.training import train, train_all
 from dptse_env.config import parse_seeds
-from dptse_env.utils.progress import make_bar
 from dptse_env.utils.validation import integer, read_json
 from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, ValidationSeeds
 
@@ -100,8 +97,7 @@ def main(args: Args) -> None:
     if len(plans) > 1 or args.executor != "local":
         train_all(plans, executor, records=args.records, threads=args.threads)
     else:
-        with shown(args.output) as reporters:
-            train(plan, args.output, records=args.records, **reporters)
+        train(plan, args.output, records=args.records)
     found: dict[str, Any] = {"trainings": [result(folder) for folder in plans]}
     lines = [in_words(**each) for each in found["trainings"]]
     if len(plan.envs) == 1:
@@ -112,41 +108,11 @@ def main(args: Args) -> None:
     args.answer(found, *lines)
 
 
-@contextlib.contextmanager
-def shown(folder: Path) -> Iterator[dict[str, Any]]:
-    """Show a progress bar with the error on validation traffic beside the best rule's.
-
-    Yields the arguments of `train` by which it is told.
-    """
-    errors: dict[str, str] = {}
-    look = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
-    with make_bar(100, desc="training", unit="%", bar_format=look) as bar:
-
-        def add(row: Row) -> None:
-            rule, error = best_rule(folder)
-            errors.update(validation=f"{1000 * least(row):.1f}", **{rule: f"{1000 * error:.1f}"})
-
-        def progress(fraction: float, stage: str) -> None:
-            done = round(100 * fraction)
-            if not bar.n:  # what was done before says nothing of the pace
-                bar.initial = done
-            bar.n = done
-            bar.set_postfix({**errors, **({"now": stage} if stage else {})})
-
-        yield {"watchers": (add,), "progress": progress}
-
-
-def best_rule(folder: Path) -> tuple[str, float]:
-    """Return the rule of least error in the folder of a training, with its error."""
-    rules: dict[str, float] = read_json(folder / RULES_FILE)
-    return min(rules.items(), key=lambda each: each[1])
-
-
 def result(folder: Path) -> dict[str, Any]:
     """Return the best policy of a training, its error in validation, and the best rule's."""
-    rule, error = best_rule(folder)
+    rule, other = best_rule(read_json(folder / RULES_FILE))
     own = min(map(least, read_progress(folder)))
-    return {"policy": str(folder / BEST), "error": own, "best_rule": rule, "rule_error": error}
+    return {"policy": str(folder / BEST), "error": own, "best_rule": rule, "rule_error": other}
 
 
 def in_words(policy: str, error: float, best_rule: str, rule_error: float) -> str:

@@ -18,7 +18,7 @@ from agents.filters.collecting import Batch, Episodes, collect, draw_batch
 from agents.filters.network import RecurrentNetwork, second_loss, teacher_loss
 from agents.filters.plan import OWN, FilterPlan, played_by
 from agents.play import play
-from agents.training.run_files import Row, TrainingFolder, Watcher
+from agents.training.run_files import Row, TrainingFolder
 from dptse_env.estimators.recurrent import read_weights, write_weights
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE
 from dptse_env.importers.folder import ROAD, new_folder
@@ -88,7 +88,6 @@ class FilterTraining(TrainingFolder):
         folder: Path,
         *,
         records: Records = None,
-        watchers: Sequence[Watcher] = (),
         executor: Executor = this_process,
     ) -> None:
         """Take a folder, and what it has; see `TrainingFolder`.
@@ -97,10 +96,9 @@ class FilterTraining(TrainingFolder):
             plan: The plan.
             folder: The folder; made if it is missing.
             records: Library of records, or its folder; None for the user's cache.
-            watchers: Receive every row of the learning curve, those of the checkpoint first.
             executor: Plays the scenarios.
         """
-        super().__init__(folder, plan.settings(), watchers)
+        super().__init__(folder, plan.settings())
         self.plan, self._records, self._executor = plan, records, executor
         torch.manual_seed(plan.seed)
         self.network = RecurrentNetwork(plan.width)
@@ -115,7 +113,6 @@ class FilterTraining(TrainingFolder):
             self._optimiser.load_state_dict(self.checkpoint["optimiser"])
             self._average.load_state_dict(self.checkpoint["average"])
             self.done, self._seconds = self.checkpoint["done"], self.checkpoint["seconds"]
-        self.restore()
 
     def run(self) -> None:
         """Train to the end of the plan, and save the weights beside the checkpoint."""

@@ -172,7 +172,7 @@ class Follow(BaseCallback, KVWriter):
             model.ent_coef = self._between(first, last)
         if self.done >= min(len(self._run.rows) / self._settings.validations, 1.0):
             model.dump_logs()
-        self._run.progress(self.done, "")
+        self._run.show(self._steps)
 
     def _on_step(self) -> bool:
         return self.done < 1.0

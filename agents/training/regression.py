@@ -19,6 +19,7 @@ from agents.training.settings import Regression
 from dptse_env.process import QueryProcess
 from dptse_env.sb3 import RoadPolicy, SB3VecEnv
 from dptse_env.utils.arrays import FloatArray, Observation
+from dptse_env.utils.progress import make_bar
 
 FLOOR = 1e-4
 """Added to squared errors: below an error of a hundredth, differences do not matter."""
@@ -35,9 +36,6 @@ LEVEL = -3.0
 
 DECAY = 0.95
 """Fraction by which the learning rate has fallen at the end."""
-
-REPORT_INTERVAL = 50
-"""Minibatches between two reports of progress."""
 
 
 def squared_errors(process: QueryProcess) -> Observation:
@@ -91,7 +89,6 @@ class Practice:
 def regress(
     practice: Sequence[Practice],
     settings: Regression,
-    progress: Callable[[float], None] = lambda fraction: None,
     targets: Callable[[QueryProcess], Observation] = squared_errors,
 ) -> None:
     """Let policies act, and fit their common scores in place to the squared errors that follow.
@@ -105,7 +102,6 @@ def regress(
     Args:
         practice: Policies that share a scorer, each in an environment of its own.
         settings: Of the regression.
-        progress: Called with the fraction of the fits that is done.
         targets: Squared errors of a process.
     """
     policy, bonus = practice[0].policy, {"age": settings.age_bonus}
@@ -113,27 +109,27 @@ def regress(
     optimizer = torch.optim.Adam([*policy.scorer.parameters(), levels], lr=settings.rate)
     batches = settings.batches * len(practice)
     _add(policy, RULE, 1.0)
-    for index in range(settings.rounds):
-        for each in practice:
-            each.collect(settings, targets)
-        if index:
-            _add(policy, bonus, -settings.sharpness)
-        else:
-            _add(policy, RULE, -1.0)
-            _add(policy, VARIANCE, settings.sharpness)
-        samples = [(torch.cat(each.seen), torch.cat(each.errors)) for each in practice]
-        for batch in range(batches):
-            done = (index + batch / batches) / settings.rounds
-            optimizer.param_groups[0]["lr"] = settings.rate * (1.0 - DECAY * done)
-            k = batch % len(practice)
-            loss = practice[k].loss(*samples[k], levels[k], settings.sharpness)
-            optimizer.zero_grad()
-            torch.autograd.backward(loss)
-            torch.nn.utils.clip_grad_norm_(policy.scorer.parameters(), settings.max_grad_norm)
-            optimizer.step()
-            if batch % REPORT_INTERVAL == 0:
-                progress(done)
-        _add(policy, bonus, settings.sharpness)
+    with make_bar(batches * settings.rounds, desc="regression", unit="batch", leave=False) as bar:
+        for index in range(settings.rounds):
+            for each in practice:
+                each.collect(settings, targets)
+            if index:
+                _add(policy, bonus, -settings.sharpness)
+            else:
+                _add(policy, RULE, -1.0)
+                _add(policy, VARIANCE, settings.sharpness)
+            samples = [(torch.cat(each.seen), torch.cat(each.errors)) for each in practice]
+            for batch in range(batches):
+                done = (index + batch / batches) / settings.rounds
+                optimizer.param_groups[0]["lr"] = settings.rate * (1.0 - DECAY * done)
+                k = batch % len(practice)
+                loss = practice[k].loss(*samples[k], levels[k], settings.sharpness)
+                optimizer.zero_grad()
+                torch.autograd.backward(loss)
+                torch.nn.utils.clip_grad_norm_(policy.scorer.parameters(), settings.max_grad_norm)
+                optimizer.step()
+                bar.update()
+            _add(policy, bonus, settings.sharpness)
     policy.scorer.zero_grad()
 
 

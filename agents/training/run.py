@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,12 @@ from agents.figures import COLOURS, draw_rule, finish_figure, make_figure, save_
 from agents.files import write_json
 from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
-from agents.training.run_files import Row, TrainingFolder, Watcher
-from agents.training.settings import TrainingPlan
+from agents.training.run_files import Row, TrainingFolder
+from agents.training.settings import PlackettLuceSettings, TrainingPlan
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import ActingPolicy, save_policy
 from dptse_env.traffic import Records
+from dptse_env.utils.progress import make_bar
 from dptse_env.utils.validation import read_json, require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
@@ -39,13 +40,6 @@ RULES = (
 )  # fmt: skip
 """Rules whose errors on validation traffic a training is shown beside."""
 
-Progress = Callable[[float, str], None]
-"""Called with the fraction of a training that is done, and the name of its stage, if it has any."""
-
-
-def silent(fraction: float, stage: str) -> None:
-    """Show no progress."""
-
 
 class Run(TrainingFolder):
     """The training of a policy.
@@ -53,32 +47,28 @@ class Run(TrainingFolder):
     Attributes:
         plan: The plan.
         keywords: Further keywords of all environments that are trained in.
-        progress: Told of stages.
+        bar: Shows how much of the training is done, and the last error beside the best rule's.
         rules: Errors of rules on validation traffic, by name.
     """
 
-    def __init__(
-        self,
-        plan: TrainingPlan,
-        folder: Path,
-        records: Records,
-        watchers: Sequence[Watcher],
-        progress: Progress,
-    ) -> None:
+    def __init__(self, plan: TrainingPlan, folder: Path, records: Records) -> None:
         """Take a folder, and play the rules; see `TrainingFolder` and `train`."""
-        super().__init__(folder, plan.content(), watchers)
-        self.plan, self.progress = plan, progress
+        super().__init__(folder, plan.content())
+        self.plan = plan
         self.keywords: dict[str, Any] = {
             "records": records,
             "action": plan.algorithm.action,
             "traffic_seeds": list(plan.traffic_seeds),
         }
-        self.rules = keep_rules(plan, folder, records, progress)
-        self.restore()
+        self.rules = keep_rules(plan, folder, records)
         self._best = min(map(least, self.rows), default=np.inf)
         # The clock of the training starts when the rules have been played. It is that of the
         # processor, so that what else runs on a machine takes nothing from a training.
         self._begun = time.process_time() - (self.rows[-1]["seconds"] if self.rows else 0.0)
+        look = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
+        # What was done before says nothing of the pace.
+        before = round(100 * self.done(self.steps))
+        self.bar = make_bar(100, desc="training", unit="%", bar_format=look, initial=before)
 
     @property
     def steps(self) -> int:
@@ -86,11 +76,21 @@ class Run(TrainingFolder):
         return int(self.rows[-1]["steps"]) if self.rows else 0
 
     def done(self, steps: int) -> float:
-        """Return the fraction of a training by minutes or by steps that is done."""
+        """Return the fraction of the training that is done, by minutes, by steps or by rounds."""
         if self.plan.minutes is not None:
             return min((time.process_time() - self._begun) / (60.0 * self.plan.minutes), 1.0)
+        if isinstance(self.plan.algorithm, PlackettLuceSettings):
+            return len(self.rows) / (self.plan.algorithm.swaps.rounds + 1)
         assert self.plan.steps is not None
         return min(steps / self.plan.steps, 1.0)
+
+    def show(self, steps: int) -> None:
+        """Show how much of the training is done."""
+        errors = dict([best_rule(self.rules)])
+        if self.rows:
+            errors["validation"] = least(self.rows[-1])
+        self.bar.n = round(100 * self.done(steps))
+        self.bar.set_postfix({name: f"{1000 * error:.1f}" for name, error in errors.items()})
 
     def add(self, steps: int, values: Row) -> None:
         """Add a row to the curve.
@@ -104,6 +104,7 @@ class Run(TrainingFolder):
         self.append(row)
         if self._board is not None:
             self._board.write(row, dict.fromkeys(row, ()), steps)
+        self.show(steps)
 
     def validate(
         self, policies: Sequence[BasePolicy], steps: int, scaled: VecNormalize | None = None
@@ -201,9 +202,12 @@ def least(row: Row) -> float:
     return min(row["validation"], row["validation_drawn"])
 
 
-def keep_rules(
-    plan: TrainingPlan, folder: Path, records: Records, progress: Progress = silent
-) -> dict[str, float]:
+def best_rule(rules: Mapping[str, float]) -> tuple[str, float]:
+    """Return the rule of least error, with its error."""
+    return min(rules.items(), key=lambda each: each[1])
+
+
+def keep_rules(plan: TrainingPlan, folder: Path, records: Records) -> dict[str, float]:
     """Return the errors of `RULES` on validation traffic, which are played once for a folder.
 
     A rule that does not suit an environment, such as one for single segments, is left out.
@@ -217,21 +221,16 @@ def keep_rules(
         require(isinstance(kept, dict) and len(kept) > 0, str(path), "errors by rule", kept)
         return kept
     errors: dict[str, float] = {}
-    for rule in RULES:
-        cells = [
-            Cell(world.env, rule, world.keywords, noise_seed=TRAINING_VALIDATION.start)
-            for world in plan.worlds
-        ]
-        try:
-            for cell in cells:
-                cell.check()
-        except ValueError:
-            continue
-        progress(0.0, rule)
-        rewards = [
-            [row["reward"] for row in play(cell, plan.validation_seeds, records)] for cell in cells
-        ]
-        errors[rule] = -float(np.mean(rewards))
+    with make_bar(len(RULES), desc="rules", unit="rule", leave=False) as bar:
+        for rule in RULES:
+            cells = [
+                Cell(world.env, rule, world.keywords, noise_seed=TRAINING_VALIDATION.start)
+                for world in plan.worlds
+            ]
+            if all(cell.misfit() is None for cell in cells):
+                played = [play(cell, plan.validation_seeds, records) for cell in cells]
+                errors[rule] = -float(np.mean([[row["reward"] for row in rows] for rows in played]))
+            bar.update()
     write_json(path, errors)
     return errors
 

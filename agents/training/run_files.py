@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,6 @@ FORMAT = 5
 
 Row = dict[str, float]
 
-Watcher = Callable[[Row], None]
-"""Receives every row of the learning curve as it comes."""
-
 
 class TrainingFolder:
     """A training in its folder. A checkpoint has the curve up to it, so that the two agree.
@@ -32,16 +29,15 @@ class TrainingFolder:
     Attributes:
         folder: The folder.
         checkpoint: What `keep` was given last, by an earlier process; None where there was none.
-        rows: The learning curve so far; empty until `restore`.
+        rows: The learning curve so far.
     """
 
-    def __init__(self, folder: Path, plan: Mapping[str, Any], watchers: Sequence[Watcher]) -> None:
+    def __init__(self, folder: Path, plan: Mapping[str, Any]) -> None:
         """Take a folder, which is made if it is missing.
 
         Args:
             folder: The folder.
             plan: What the numbers of the training depend on, as plain JSON.
-            watchers: Receive every row of the curve, those of the checkpoint first.
 
         Raises:
             ValueError: The folder belongs to another plan, or its checkpoint is damaged.
@@ -49,19 +45,12 @@ class TrainingFolder:
         """
         self.checkpoint = read_checkpoint(folder)  # may refuse it; nothing is written then
         keep_plan(folder, plan)
-        self.folder, self._watchers = folder, watchers
-        self.rows: list[Row] = []
-
-    def restore(self) -> None:
-        """Take the rows of the checkpoint."""
-        for row in self.checkpoint["rows"] if self.checkpoint else ():
-            self.append(row)
+        self.folder = folder
+        self.rows: list[Row] = list(self.checkpoint["rows"]) if self.checkpoint else []
 
     def append(self, row: Row) -> None:
-        """Add a row to the curve, and show it to the watchers."""
+        """Add a row to the curve."""
         self.rows.append(row)
-        for watcher in self._watchers:
-            watcher(row)
 
     def keep(self, **content: Any) -> None:
         """Write a checkpoint of tensors, numbers and strings, and the curve.

@@ -21,7 +21,7 @@ exp(step g)); then gains are measured anew, under the new policy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,7 @@ from dptse_env.evaluation import Policy
 from dptse_env.process import QueryProcess
 from dptse_env.sb3 import RoadPolicy
 from dptse_env.utils.arrays import Action, AnyArray, FloatArray, IntArray, Observation
+from dptse_env.utils.progress import make_bar
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 LARGEST_GAIN = 0.6
@@ -44,9 +45,6 @@ PART = 4096
 
 SEED_STRIDE = 10_000
 """Between the seeds of two rounds; the first begins a stride after those of the regression."""
-
-REPORT_INTERVAL = 50
-"""Minibatches between two reports of progress."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,6 @@ def try_swaps(
     settings: SwapRounds,
     index: int,
     seed: int,
-    progress: Callable[[float], None] = lambda fraction: None,
 ) -> Swaps:
     """Run the episodes of a round, and try swaps in states along the way.
 
@@ -89,7 +86,6 @@ def try_swaps(
         settings: Of rounds.
         index: Number of the round, counted from 0.
         seed: Training seed. Draws depend on it and on ``index`` alone, but for those of torch.
-        progress: Called with the fraction of the episodes that is done.
 
     Returns:
         The swaps of every ``settings.seconds``, in states of the same second in all episodes.
@@ -103,13 +99,15 @@ def try_swaps(
     for _ in range(first):
         observation = env.advance(_drawn(policy, observation)).observation
     parts: list[tuple[AnyArray, ...]] = []
-    for second in range(first, horizon - seconds + 1, seconds):
-        before, shown, actions = env.process.fork(), observation, []
-        for _ in range(seconds):
-            actions.append(_drawn(policy, observation))
-            observation = env.advance(actions[-1]).observation
-        parts.append(_tried(before, shown, actions, generator, settings.trials, len(parts)))
-        progress((second + seconds) / horizon)
+    n_states = (horizon - first) // seconds
+    with make_bar(n_states, desc="swaps", unit="state", leave=False) as bar:
+        for _ in range(n_states):
+            before, shown, actions = env.process.fork(), observation, []
+            for _ in range(seconds):
+                actions.append(_drawn(policy, observation))
+                observation = env.advance(actions[-1]).observation
+            parts.append(_tried(before, shown, actions, generator, settings.trials, len(parts)))
+            bar.update()
     return Swaps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -205,7 +203,6 @@ def raise_scores(
     swaps: Sequence[Swaps],
     settings: SwapRounds,
     step: float,
-    progress: Callable[[float], None] = lambda fraction: None,
 ) -> None:
     """Raise the scores of policies in place by ``step`` times the expected gain of a query.
 
@@ -214,7 +211,6 @@ def raise_scores(
         swaps: Those tried under each of them.
         settings: Of rounds.
         step: Rise of a score for an expected gain of one mean one-second error.
-        progress: Called with the fraction of the fit that is done.
     """
     scorer = policies[0].scorer
     n = policies[0].road.n_mainline
@@ -225,12 +221,12 @@ def raise_scores(
     batches = settings.batches * len(gains)
     optimizer = torch.optim.Adam(scorer.parameters(), lr=settings.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, batches)
-    for batch in range(batches):
-        loss = gains[batch % len(gains)].loss(step)
-        optimizer.zero_grad()
-        torch.autograd.backward(loss)
-        optimizer.step()
-        schedule.step()
-        if batch % REPORT_INTERVAL == 0:
-            progress(batch / batches)
+    with make_bar(batches, desc="fit", unit="batch", leave=False) as bar:
+        for batch in range(batches):
+            loss = gains[batch % len(gains)].loss(step)
+            optimizer.zero_grad()
+            torch.autograd.backward(loss)
+            optimizer.step()
+            schedule.step()
+            bar.update()
     scorer.zero_grad()

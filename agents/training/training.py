@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -16,22 +16,15 @@ from agents.play import record
 from agents.seeds import training_seed
 from agents.training.learning import learn
 from agents.training.regression import Practice, regress
-from agents.training.run import POLICY, RULES_FILE, Progress, Run, keep_rules, silent
-from agents.training.run_files import Row, Watcher, check_plan, keep_plan, read_checkpoint
+from agents.training.run import POLICY, RULES_FILE, Run, keep_rules
+from agents.training.run_files import Row, check_plan, keep_plan, read_checkpoint
 from agents.training.settings import PlackettLuceSettings, TrainingPlan
 from agents.training.swaps import raise_scores, try_swaps
 from dptse_env.sb3 import RoadPolicy, SB3VecEnv
 from dptse_env.traffic import Records
 
 
-def train(
-    plan: TrainingPlan,
-    folder: Path,
-    *,
-    records: Records = None,
-    watchers: Sequence[Watcher] = (),
-    progress: Progress = silent,
-) -> list[Row]:
+def train(plan: TrainingPlan, folder: Path, *, records: Records = None) -> list[Row]:
     """Train to the end of a plan in its folder, and return the learning curve.
 
     The folder gets ``plan.json``, ``rules.json`` (errors of rules on validation traffic),
@@ -43,17 +36,15 @@ def train(
         plan: The plan.
         folder: The folder; made if it is missing.
         records: Library of records, or its folder; None for the user's cache.
-        watchers: Receive every row of the curve, those of the checkpoint first.
-        progress: Called between two rows with the fraction of the training that is done and the
-            name of a stage.
 
     Raises:
         ValueError: The algorithm cannot train in the environments, the folder belongs to another
             plan, or its checkpoint is damaged.
         OSError: The folder cannot be written; the last checkpoint stays.
     """
-    run = Run(plan, folder, records, watchers, progress)
-    (train_in_rounds if isinstance(plan.algorithm, PlackettLuceSettings) else learn)(run)
+    run = Run(plan, folder, records)
+    with run.bar:
+        (train_in_rounds if isinstance(plan.algorithm, PlackettLuceSettings) else learn)(run)
     run.finish()
     return run.rows
 
@@ -79,14 +70,8 @@ def train_in_rounds(run: Run) -> None:
         run.add(steps, {**values, **run.validate(policies, steps)})
         run.keep(policy=policies[0].state_dict(), torch=torch.get_rng_state())
 
-    def show(stage: str, fraction: float) -> None:
-        # A round's swaps and its fit count alike, and the regression as one round.
-        part = fraction if stage == "regression" else 0.5 * (fraction + (stage == "fit"))
-        in_rounds = (len(run.rows) + part) / (algorithm.swaps.rounds + 1)
-        run.progress(in_rounds if plan.minutes is None else run.done(run.steps), stage)
-
     if kept is None:
-        end(_regress(run, algorithm, policies, partial(show, "regression")), {})
+        end(_regress(run, algorithm, policies), {})
     settings, lasted = algorithm.swaps, 0.0
 
     def next_round() -> float | None:
@@ -108,21 +93,16 @@ def train_in_rounds(run: Run) -> None:
     while (done := next_round()) is not None:
         index = len(run.rows) - 1
         tried = [
-            try_swaps(policy, env, settings, index, plan.seed, partial(show, "swaps"))
+            try_swaps(policy, env, settings, index, plan.seed)
             for policy, env in zip(policies, environments, strict=True)
         ]
-        raise_scores(policies, tried, settings, settings.step_of(done), partial(show, "fit"))
+        raise_scores(policies, tried, settings, settings.step_of(done))
         error = sum(float(swaps.error.mean()) for swaps in tried) / len(tried)
         end(run.steps + seconds, {"error": error})
         lasted = run.done(run.steps) - done if plan.minutes is not None else 0.0
 
 
-def _regress(
-    run: Run,
-    algorithm: PlackettLuceSettings,
-    policies: Sequence[RoadPolicy],
-    progress: Callable[[float], None],
-) -> int:
+def _regress(run: Run, algorithm: PlackettLuceSettings, policies: Sequence[RoadPolicy]) -> int:
     """Do the regression; return the seconds of traffic that it took. Its memory is freed then."""
     settings = algorithm.regression
     if not settings.rounds:
@@ -135,7 +115,7 @@ def _regress(
         episodes.seed(training_seed(run.plan.seed))
         practice.append(Practice(policy, episodes, world.part(settings.batch_size)))
         seconds += n * settings.seconds * settings.rounds
-    regress(practice, settings, progress)
+    regress(practice, settings)
     return seconds
 
 
@@ -145,7 +125,6 @@ def train_all(
     *,
     records: Records = None,
     threads: int = 1,
-    progress: bool = True,
 ) -> None:
     """Train every plan in its folder to the end; what the folders have is gone on with.
 
@@ -158,7 +137,6 @@ def train_all(
         executor: Runs the trainings.
         records: Library of records, or its folder; None for the user's cache.
         threads: Threads of torch in each training; numbers depend on it in the last digits.
-        progress: Whether to show a progress bar.
 
     Raises:
         ValueError: A folder belongs to another plan, or its checkpoint is damaged.
@@ -180,7 +158,7 @@ def train_all(
     def take(index: int, _: None) -> None:
         require_trained(tasks[index][1], POLICY)
 
-    run_shown(executor, work, tasks, take, progress=progress, desc="training", unit="training")
+    run_shown(executor, work, tasks, take, desc="training", unit="training")
 
 
 def require_trained(folder: Path, file: str) -> None:

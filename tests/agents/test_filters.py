@@ -22,6 +22,7 @@ from dptse_env.estimators.recurrent_kernels import LONGEST_AGE  # noqa: E402
 from dptse_env.evaluation import evaluate  # noqa: E402
 from dptse_env.traffic import RecordLibrary, read_corridor  # noqa: E402
 from tests.agents.elsewhere import elsewhere  # noqa: E402
+from tests.agents.training.plans import StopError, ended_at, stop  # noqa: E402
 from tests.estimators.helpers import card  # noqa: E402
 from tests.helpers import SHORT  # noqa: E402
 
@@ -318,10 +319,6 @@ def assert_same(training, whole):
     assert one == other
 
 
-class KilledError(Exception):
-    pass
-
-
 @pytest.mark.slow
 def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_path):
     """Wherever its scenarios are played."""
@@ -330,12 +327,8 @@ def test_a_training_that_was_killed_comes_out_as_one_that_was_not(whole, tmp_pat
     played = read_weights(str(whole.folder / "played.safetensors"))
     assert played.card["training"]["passes"] == 1  # as it stood when the second round began
 
-    def kill(row):
-        if row["update"] == 3:
-            raise KilledError
-
-    with pytest.raises(KilledError):
-        FilterTraining(PLAN, tmp_path, watchers=[kill]).run()
+    with pytest.raises(StopError), ended_at(3, stop):
+        FilterTraining(PLAN, tmp_path).run()
     resumed = FilterTraining(PLAN, tmp_path, executor=elsewhere)
     assert resumed.done == 2
     resumed.run()

@@ -1,9 +1,11 @@
-"""Trainings of a few seconds, and watchers that end them."""
+"""Trainings of a few seconds, and what ends them."""
 
+import contextlib
 import json
 import os
 import signal
 
+from agents.training.run_files import TrainingFolder
 from agents.training.settings import PlackettLuceSettings, TrainingPlan, parse_algorithm
 from tests.helpers import SHORT
 
@@ -65,21 +67,26 @@ class StopError(Exception):
     pass
 
 
-def stop_at(update):
-    """Return a watcher that ends a training as a row comes, ahead of its checkpoint."""
+@contextlib.contextmanager
+def ended_at(update, how):
+    """Call a function as a row of a curve comes, ahead of its checkpoint."""
+    append = TrainingFolder.append
 
-    def watcher(row):
+    def appended(training, row):
+        append(training, row)
         if row["update"] == update:
-            raise StopError
+            how()
 
-    return watcher
+    TrainingFolder.append = appended
+    try:
+        yield
+    finally:
+        TrainingFolder.append = append
 
 
-def kill_at(update):
-    """Return a watcher that kills this process as a row comes, ahead of its checkpoint."""
+def stop():
+    raise StopError
 
-    def watcher(row):
-        if row["update"] == update:
-            os.kill(os.getpid(), signal.SIGKILL)
 
-    return watcher
+def kill():
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -21,7 +21,7 @@ from agents.environments import make_vector
 from agents.executors import ExecutorError, this_process
 from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
-from agents.training.run import BEST, CURVE, POLICY, RULES, RULES_FILE, Run, silent
+from agents.training.run import BEST, CURVE, POLICY, RULES, RULES_FILE, Run
 from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_checkpoint, read_progress
 from agents.training.settings import ALGORITHMS, parse_algorithm
 from agents.training.training import train, train_all
@@ -35,10 +35,11 @@ from tests.agents.training.plans import (
     STEPS,
     WIDE,
     StopError,
-    kill_at,
+    ended_at,
+    kill,
     make_algorithm,
     make_plan,
-    stop_at,
+    stop,
     without_time,
 )
 from tests.helpers import SHORT, fast_and_slow
@@ -72,7 +73,8 @@ def assert_alike(folder, other):
 
 def killed(folder, update, **changes):
     """Train in a child that is killed as the row of an update comes."""
-    train(make_plan(**changes), folder, watchers=(kill_at(update),))
+    with ended_at(update, kill):
+        train(make_plan(**changes), folder)
 
 
 # --- going on -------------------------------------------------------------------------------------
@@ -111,13 +113,9 @@ def test_a_full_disk_leaves_a_folder_to_go_on_in(whole, tmp_path, monkeypatch):
         patch.setattr("pathlib.Path.replace", full)
         with pytest.raises(OSError, match="No space left"):
             train(make_plan(), tmp_path / "full")
-    stages, seen = [], []
-    rows = train(
-        make_plan(), tmp_path / "full", watchers=(seen.append,),
-        progress=lambda fraction, stage: stages.append((stage, 0.3 <= fraction <= 1.0)),
-    )  # fmt: skip
-    assert set(stages) == {("swaps", True), ("fit", True)}  # the regression is not done again
-    assert seen == rows
+    with monkeypatch.context() as patch:
+        patch.setattr("agents.training.training.regress", None)  # it is not done again
+        train(make_plan(), tmp_path / "full")
     assert_alike(tmp_path / "full", whole()[0])
 
 
@@ -137,15 +135,12 @@ def test_an_algorithm_goes_on_from_its_last_checkpoint(name, tmp_path):
     # Weights stay what they were, where they are not lost.
     still = {"learning_rate": 1e-12, "final_learning_rate": 1e-12}
     changes = {"policy": "mlp"} if name == "ppo" else {}
-    plan, before = make_plan(make_algorithm(name, **still, **changes)), []
-    with pytest.raises(StopError):
-        train(plan, tmp_path, watchers=(before.append, stop_at(2)))
+    plan = make_plan(make_algorithm(name, **still, **changes))
+    with pytest.raises(StopError), ended_at(2, stop):
+        train(plan, tmp_path)
     kept = read_checkpoint(tmp_path)
-    assert kept["rows"] == before[:2]
-    after = []
-    rows = train(plan, tmp_path, watchers=(after.append,))
-    assert rows == after
-    assert without_time(rows[:2]) == without_time(before[:2])
+    rows = train(plan, tmp_path)
+    assert rows[:2] == kept["rows"]
     assert [row["update"] for row in rows] == [0, 1, 2, 3]
     assert [row["steps"] for row in rows] == [0, 80, 160, 240]
     end = read_checkpoint(tmp_path)
@@ -250,7 +245,7 @@ def test_rules_are_played_once_on_the_same_traffic(whole, monkeypatch, tmp_path)
     rewards = [row["reward"] for row in play(cell, (1000, 1001))]
     assert kept["speed-front"] == pytest.approx(-np.mean(rewards))
     monkeypatch.setattr("agents.training.run.RULES", ("none",))
-    run = Run(make_plan(), folder, None, (), silent)
+    run = Run(make_plan(), folder, None)
     assert run.rules == kept
 
 
@@ -279,7 +274,7 @@ def test_ppo_learns_to_err_less_than_the_best_rule(tmp_path):
 
 def test_a_validation_is_seeded_and_leaves_the_draws_of_the_training_alone(whole, tmp_path):
     plan = make_plan()
-    run = Run(plan, shutil.copytree(whole()[0], tmp_path / "run"), None, (), silent)
+    run = Run(plan, shutil.copytree(whole()[0], tmp_path / "run"), None)
     policies, state = plan.algorithm.make_policies(plan.worlds), torch.get_rng_state()
     row = run.validate(policies, 0)
     assert torch.equal(torch.get_rng_state(), state)
@@ -356,11 +351,11 @@ def test_damaged_and_foreign_files_are_refused(whole, tmp_path):
 
 def test_trainings_at_once_come_out_as_alone(whole, tmp_path):
     """One of them goes on where a worker was lost, whose task is run again."""
-    with pytest.raises(StopError):
-        train(make_plan(seed=2), tmp_path / "2", watchers=(stop_at(1),))
+    with pytest.raises(StopError), ended_at(1, stop):
+        train(make_plan(seed=2), tmp_path / "2")
     rows = read_progress(tmp_path / "2")
     plans = {tmp_path / str(seed): make_plan(seed=seed) for seed in (1, 2)}
-    train_all(plans, elsewhere, progress=False)
+    train_all(plans, elsewhere)
     assert_alike(tmp_path / "1", whole()[0])
     assert read_progress(tmp_path / "2")[: len(rows)] == rows
     first, second = (read_checkpoint(folder)["policy"] for folder in plans)
@@ -370,7 +365,7 @@ def test_trainings_at_once_come_out_as_alone(whole, tmp_path):
 def test_a_folder_of_another_plan_is_refused_before_anything_runs(whole, tmp_path):
     plans = {tmp_path / "9": make_plan(), whole()[0]: make_plan(seed=9)}
     with pytest.raises(ValueError, match="seed is 1 there and 9 now"):
-        train_all(plans, this_process, progress=False)
+        train_all(plans, this_process)
     assert not (tmp_path / "9").exists()
 
 
@@ -380,7 +375,7 @@ def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
         yield 0, None
 
     with pytest.raises(ExecutorError, match="choose an --output that all nodes have"):
-        train_all({tmp_path / "0": make_plan()}, apart, progress=False)
+        train_all({tmp_path / "0": make_plan()}, apart)
 
 
 # --- non-interference; see `tests.test_non_interference` ------------------------------------------
