@@ -14,6 +14,7 @@ from filelock import FileLock
 from agents.environments import make_config, make_vector, quietly
 from agents.policies import find_policy
 from agents.watchers import WATCHERS
+from dptse_env.config import EnvConfig
 from dptse_env.estimators.recurrent import member_for, read_weights, shipped_weights
 from dptse_env.evaluation import WARM_UP, Row, evaluate
 from dptse_env.policies import TRANSFERABLE
@@ -84,6 +85,16 @@ class Cell:
     def all_keywords(self) -> dict[str, Any]:
         """Keywords of ``gym.make``; those of the policy where they do not name others."""
         return {**find_policy(self.policy).keywords, **self.keywords}
+
+    @property
+    def config(self) -> EnvConfig:
+        """Configuration of its environment.
+
+        Raises:
+            ValueError: A keyword is unknown or out of range.
+        """
+        with quietly():
+            return make_config(self.env, self.all_keywords)
 
     def check(self) -> None:
         """Check keywords, policy and watchers without playing, recording or compiling.
@@ -224,13 +235,3 @@ def record(
         return
     with FileLock(library.prepare(corridor, missing[0]) / ".lock"):
         library.ensure(corridor, seeds, workers, progress)
-
-
-def corridor_of(cell: Cell) -> Corridor:
-    """Return the road of a cell.
-
-    Raises:
-        ValueError: A keyword is unknown or out of range.
-    """
-    with quietly():
-        return make_config(cell.env, cell.all_keywords).corridor

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import polars as pl
 
 from agents.executors import Executor, run_shown, this_process
-from agents.play import Cell, corridor_of, play, record
+from agents.play import Cell, play, record
 from agents.tables import are_present, numbers
 from dptse_env.traffic import Records
 from dptse_env.utils.files import write_atomically
@@ -164,7 +164,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
         )
     for cell, _ in missing:
         cell.check()
-    for corridor, seeds in dict.fromkeys((corridor_of(cell), seeds) for cell, seeds in missing):
+    for corridor, seeds in dict.fromkeys((cell.config.corridor, seeds) for cell, seeds in missing):
         record(corridor, seeds, place.records, progress=progress)
     folder = place.folder / PARTS
     threads = None if place.executor is this_process else 1

@@ -37,9 +37,10 @@ from agents.fitting.page import DIAGRAM, PAGE, draw_diagram, verdict, write_page
 from agents.fitting.parameters import Fit, fit_parameters, is_stable, start_from, traffic_of
 from agents.fitting.road import PLAYED, Road, find_road, require_road, seeds_of
 from agents.fitting.road_file import copy_of, write_choice
+from agents.play import Cell
 from agents.search.space import SPACE, Extra
 from agents.search.tuning import Search, chosen, tune, write_set
-from agents.seeds import KINDS
+from agents.seeds import KINDS, TUNING
 from agents.tables import ERROR, Labels, values
 from agents.terminal import make_table
 from dptse_env.estimators import check_estimator
@@ -144,6 +145,8 @@ def make_searches(args: Args) -> tuple[dict[str, Search], Path]:
     policies = args.policies or ("shift-ahead",)
     require(len(policies) == 1, "policies", "one with --tune", policies)
     env, keywords = parse_env(args.env)
+    for key in ("estimator", "traffic_seeds", "records", "action"):
+        require(key not in keywords, f"env.{key}", "left out", keywords.get(key))
     folder = Path("results") / "tuning"
     if args.road is not None:
         require_road(args.road)
@@ -154,10 +157,11 @@ def make_searches(args: Args) -> tuple[dict[str, Search], Path]:
     seeds = seeds_of("training", args.train_seeds, corridor, str(args.road or env))
     found = {}
     for estimator in args.estimators or SPACE:
-        search = Search(
-            env, keywords, estimator, seeds, policies[0], args.also, args.seed, args.records
-        )  # fmt: skip
-        search.check()
+        own = {**keywords, "estimator": estimator}
+        cell = Cell(env, policies[0], own, noise_seed=TUNING.start, seeds=seeds)
+        search = Search(cell, args.also, args.seed, args.records)
+        _ = search.space
+        cell.check()
         found[search.name] = search
     return found, args.output or folder
 
@@ -206,7 +210,10 @@ def fit_road(args: Args, path: Path) -> None:
     keywords = chosen_keywords(choice, road)
     choice.notes += [*inherits(choice, keywords), *road.remarks]
     n = road.corridor.geometry.n_mainline
-    sets = {each: choice.config(parameters=each).parameters for each in (choice.home, name)}
+    sets = {
+        each: choice.cell(choice.labels("test", parameters=each)).config.parameters
+        for each in (choice.home, name)
+    }
     diagram = draw_diagram(density[:, :n], speed[:, :n], sets)
     save_figure(diagram, folder / DIAGRAM, f"{road.corridor.name}, training traffic")
     write_page(choice, played, budgets, following(args, choice, folder), folder)

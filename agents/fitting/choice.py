@@ -12,14 +12,12 @@ from typing import Any
 
 import polars as pl
 
-from agents.environments import make_config, quietly
 from agents.fitting.road import PLAYED, Road
 from agents.play import Cell
 from agents.seeds import CHOICE, EVALUATION, TUNING
 from agents.statistics import mean_interval
 from agents.study import Place, Study, play_study
 from agents.tables import ERROR, Labels, give_or_take, values
-from dptse_env.config import EnvConfig
 from dptse_env.utils.arrays import FloatArray
 
 NAME = "fit"
@@ -109,12 +107,6 @@ class Choice:
             watchers=("honesty",),
             seeds=tuple(seeds) or self.road.seeds[traffic],
         )
-
-    def config(self, **changes: Any) -> EnvConfig:
-        """Return the configuration of an episode of what is chosen, with changes of its labels."""
-        cell = self.cell(self.labels("test", **changes))
-        with quietly():
-            return make_config(cell.env, cell.all_keywords)
 
     def play(self, wanted: Sequence[Labels], seeds: Sequence[int] = ()) -> list[Labels]:
         """Play cells, and return the labels of those that the environment does not refuse.

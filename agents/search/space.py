@@ -104,12 +104,9 @@ def search_space(estimator: str, extras: Collection[Extra] = ()) -> dict[str, Kn
         extras: Names in `EXTRAS`.
 
     Raises:
-        ValueError: A name is unknown, there is nothing to tune, or the estimator has no demand
-            states.
+        ValueError: The estimator has nothing to tune, or no demand states.
     """
     require_name("estimators", estimator, SPACE)
-    for name in extras:
-        require_name("also", name, EXTRAS)
     if "demand" in extras and estimator in ("random_walk", "asm"):
         raise ValueError(
             f"also must leave out demand for {estimator!r}, which has no traffic model"

@@ -14,7 +14,7 @@ import dataclasses
 import logging
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import cached_property, partial
@@ -28,7 +28,6 @@ from optuna.samplers import TPESampler
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
-from agents.environments import make_config, quietly
 from agents.executors import Executor, run_shown
 from agents.play import Cell, play
 from agents.search.space import (
@@ -41,14 +40,13 @@ from agents.search.space import (
     search_space,
     values_of,
 )
-from agents.seeds import TUNING
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import EstimatorSettings
 from dptse_env.estimators.tuned import settings_name, write_settings
 from dptse_env.evaluation import Row
 from dptse_env.traffic import Records
 from dptse_env.utils.files import json_digest, replacing
-from dptse_env.utils.validation import from_mapping, require
+from dptse_env.utils.validation import from_mapping
 from dptse_env.versions import code_version
 
 logger = logging.getLogger(__name__)
@@ -68,68 +66,63 @@ class Search:
     """The search for one set of settings.
 
     Attributes:
-        env: Id of the environment.
-        keywords: Its keywords.
-        estimator: Name of the estimator.
-        seeds: Training traffic, neighbouring seeds.
-        policy: Query policy that is played, as `agents.policies.find_policy` takes it.
+        cell: What a trial plays, but for the settings; its traffic seeds are neighbours.
         also: Further settings to search, names in `agents.search.space.EXTRAS`.
         seed: Seeds the proposals.
         records: Library of records, or its folder; None for the user's cache.
     """
 
-    env: str
-    keywords: Mapping[str, Any]
-    estimator: str
-    seeds: tuple[int, ...]
-    policy: str = "shift-ahead"
+    cell: Cell
     also: tuple[Extra, ...] = ()
     seed: int = 0
     records: Records = None
+
+    @property
+    def estimator(self) -> str:
+        """Name of the estimator."""
+        return str(self.cell.keywords["estimator"])
 
     @property
     def space(self) -> dict[str, Knob]:
         """The search space, by path into the settings."""
         return search_space(self.estimator, self.also)
 
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The traffic seeds."""
+        return self.cell.seeds or ()
+
     @cached_property
     def config(self) -> EnvConfig:
         """Configuration of the environment, with the settings that it has without a search."""
-        cell = self.cell()
-        with quietly():
-            return make_config(cell.env, cell.all_keywords)
+        return self.cell.config
 
     @property
     def name(self) -> str:
-        """Name of the set, and of its files."""
+        """Name of the set, and of its file."""
         config = self.config
         name = settings_name(self.estimator, config.parameters.name, str(config.privacy.preset))
         return name.replace(":", ".")  # Windows has no files with a colon
 
     @property
-    def stretch(self) -> str:
-        """The traffic seeds as ``"first:stop"``."""
-        return f"{self.seeds[0]}:{self.seeds[-1] + 1}"
+    def study_name(self) -> str:
+        """Name of the set with a digest of all that makes scores comparable."""
+        content = {
+            "cell": self.cell.id,
+            "corridor": self.config.corridor.digest,
+            "parameters": dataclasses.asdict(self.config.parameters),
+            "seeds": self.seeds,
+            "seed": self.seed,
+            "dptse-env": code_version(),
+            "also": self.also,
+        }
+        return f"{self.name} {json_digest(content)[:12]}"
 
-    def cell(self, settings: EstimatorSettings | None = None) -> Cell:
-        """Return what a trial plays; with the environment's own settings if None."""
-        keywords = {**self.keywords, "estimator": self.estimator}
-        if settings is not None:
-            keywords["estimator_settings"] = dataclasses.asdict(settings)
-        return Cell(self.env, self.policy, keywords, noise_seed=TUNING.start)
-
-    def check(self) -> None:
-        """Check everything without playing or recording.
-
-        Raises:
-            FileNotFoundError: There is no such saved policy.
-            ValueError: A value is out of range, or there is nothing to tune.
-        """
-        _ = self.space
-        for key in ("estimator", "traffic_seeds", "records", "action"):
-            require(key not in self.keywords, f"env.{key}", "left out", self.keywords.get(key))
-        self.cell().check()
-        require(Path(self.name).name == self.name, "set", "the name of a file", self.name)
+    def is_begun(self, journal: Path) -> bool:
+        """Return whether a journal has trials of this search."""
+        there = os.path.lexists(journal)  # its name may be too long
+        names = optuna.get_all_study_names(_storage(journal)) if there else []
+        return self.study_name in names
 
     def starts(self) -> list[tuple[str, dict[str, Any]]]:
         """Return labels and values of the first trials: ``defaults`` and ``present`` settings."""
@@ -151,27 +144,8 @@ class Search:
 
     def play(self, settings: EstimatorSettings, seeds: Sequence[int]) -> list[Row]:
         """Play an episode on each traffic seed with given settings, as one batch."""
-        return play(self.cell(settings), seeds, self.records)
-
-    @property
-    def study_name(self) -> str:
-        """Name of the set with a digest of all that makes scores comparable."""
-        content = {
-            "cell": self.cell().id,
-            "corridor": self.config.corridor.digest,
-            "parameters": dataclasses.asdict(self.config.parameters),
-            "seeds": self.stretch,
-            "seed": self.seed,
-            "dptse-env": code_version(),
-            "also": self.also,
-        }
-        return f"{self.name} {json_digest(content)[:12]}"
-
-    def is_begun(self, journal: Path) -> bool:
-        """Return whether a journal has trials of this search."""
-        there = os.path.lexists(journal)  # its name may be too long
-        names = optuna.get_all_study_names(_storage(journal)) if there else []
-        return self.study_name in names
+        keywords = {**self.cell.keywords, "estimator_settings": dataclasses.asdict(settings)}
+        return play(dataclasses.replace(self.cell, keywords=keywords), seeds, self.records)
 
 
 def tune(search: Search, journal: Path, n_trials: int, executor: Executor) -> optuna.Study:
@@ -227,11 +201,11 @@ def write_set(search: Search, study: optuna.Study, path: Path) -> dict[str, Any]
     best, config = chosen(study)["tuned"], search.config
     provenance = {
         "corridor": config.corridor.name,
-        "schedule": search.policy,
+        "schedule": search.cell.policy,
         "bandwidth": config.bandwidth,
         "epsilon": config.privacy.epsilon,
         "delta": config.privacy.delta,
-        "seeds": search.stretch,
+        "seeds": f"{search.seeds[0]}:{search.seeds[-1] + 1}",
         "n_trials": n_finished(study),
         **{key: round(best.user_attrs[key], 2) for key in SCORES[1:]},
         "at_bounds": [at for at, knob in search.space.items() if at_bound(knob, best.params[at])],

@@ -44,7 +44,7 @@ from agents.figures import (
     shifted,
 )
 from agents.page import watch
-from agents.play import Cell, corridor_of, record
+from agents.play import Cell, record
 from agents.statistics import Interval, mean_interval
 from agents.study import Place, Study, read_table
 from agents.tables import (
@@ -153,7 +153,7 @@ def measure_run_time(place: Place) -> pl.DataFrame:
     They are played one at a time in this process, estimators in turns, so that a drift of the
     machine hits them all alike. The estimate at the reset is counted with the steps.
     """
-    record(corridor_of(CELLS[0]), SEEDS[:N_TIMED], place.records)
+    record(CELLS[0].config.corridor, SEEDS[:N_TIMED], place.records)
     timed = []
     for labels in once(labels_of(*pair) for pair in PAIRS):
         with quietly():
@@ -174,7 +174,7 @@ def measure_run_time(place: Place) -> pl.DataFrame:
 
 def measure_space_time(place: Place) -> pl.DataFrame:
     """Return true and estimated densities of an episode of each estimator, to 1 veh/km."""
-    record(corridor_of(CELLS[0]), SEEDS[:1], place.records)
+    record(CELLS[0].config.corridor, SEEDS[:1], place.records)
     rows = []
     for labels in once(labels_of(*pair, bandwidth=MAP_SEGMENTS) for pair in PAIRS):
         watched = watch(SCHEDULE, Cell(ENV, SCHEDULE, labels), SEEDS[0], place.records)
@@ -455,7 +455,7 @@ def draw_sweep(rows: pl.DataFrame, field: str, metrics: Sequence[str], columns: 
 
 def draw_space_time(table: pl.DataFrame) -> Figure:
     """Draw maps of density: truth on top, then each estimator; a column for each setting."""
-    corridor = corridor_of(CELLS[0])
+    corridor = CELLS[0].config.corridor
     lengths = corridor.geometry.segment_lengths[: corridor.geometry.n_mainline]
     history = History(0, corridor.conditions.duration, lengths, corridor.scales.density_scale)
     columns = []

@@ -88,6 +88,10 @@ def finished(journal):
         (["--train-seeds", "2000:2008"], "train_seeds must be traffic seeds"),
         (["--test-seeds", "2000:2008"], "--test-seeds must be left out with --tune"),
         (["--keep-fitted"], "--keep-fitted must be left out with --tune"),
+        (["--estimators", "recurrent"], "estimators must be one of ekf"),
+        (["--also", "demand"], "also must leave out demand for 'random_walk'"),
+        (["--env", f'{SHORT} {{"estimator": "ukf"}}'], "env.estimator must be left out"),
+        (["--env", f'{SHORT} {{"cargo": 1}}'], "cargo"),
         (["road.toml", "--env", f'{SHORT} {{"corridor": {{}}}}'], "env.corridor must be left out"),
     ],
 )

@@ -7,7 +7,6 @@ import polars as pl
 import pytest
 
 from agents.executors import this_process
-from agents.play import corridor_of
 from agents.studies import estimators as study
 from agents.studies.estimators import STUDY, sensed
 from agents.study import Place, read_rows, run
@@ -80,9 +79,9 @@ def test_faults_are_those_of_one_detector():
     high, low = (study.sensed_cell(study.miscounting("printed", "ekf")[k]) for k in (1, 4))
     assert high.keywords["detectors"]["factor"] == pytest.approx([1.0, 4.0 / 3.0, 1.0])
     assert low.keywords["detectors"]["factor"] == pytest.approx([1.0, 2.0 / 3.0, 1.0])
-    assert corridor_of(low).fixed_sensors == (3, 7, 11)
+    assert low.config.corridor.fixed_sensors == (3, 7, 11)
     queries = study.sensed_cell(sensed("printed", "ekf", sensors=study.QUERIES))
-    assert corridor_of(queries).fixed_sensors == ()
+    assert queries.config.corridor.fixed_sensors == ()
 
 
 def test_networks_of_other_seeds_are_played_in_every_world_beside_that_of_the_package():
