@@ -7,6 +7,7 @@ import sys
 import threading
 import warnings
 from concurrent.futures import Future
+from typing import ClassVar
 
 import loky
 import pytest
@@ -110,12 +111,12 @@ def test_a_task_whose_worker_died_runs_again_three_times(monkeypatch):
     """With processes in this one, which die as often as they should."""
 
     class Mortal:
-        deaths = 3
+        deaths: ClassVar = {-1: 3, -2: 6}
 
         def submit(self, work, task):
             future = Future()
-            if self.deaths and task < 0:
-                self.deaths -= 1
+            if self.deaths.get(task):
+                self.deaths[task] -= 1
                 future.set_exception(loky.BrokenProcessPool())
             else:
                 future.set_result(work(task))
@@ -123,11 +124,11 @@ def test_a_task_whose_worker_died_runs_again_three_times(monkeypatch):
 
     pool, executor = Mortal(), make_executor("local", 2)
     monkeypatch.setattr(loky, "get_reusable_executor", lambda *_, **__: pool)
-    assert run(executor, abs, [1, -2]) == [1, 2]
-    pool.deaths = 4
+    assert run(executor, abs, [-1, -2]) == [1, 2]  # three times after the last result
+    pool.deaths[-2] = 4
     with pytest.raises(ExecutorError, match="a task was lost 4 times"):
         run(executor, abs, [1, -2])
-    assert pool.deaths == 0
+    assert pool.deaths[-2] == 0
 
 
 PROGRAM = """
