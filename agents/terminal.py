@@ -40,8 +40,3 @@ def print_table(table: Table) -> None:
         needed = Measurement.get(console, console.options.update(max_width=_UNLIMITED), table)
         console.width = max(console.width, needed.maximum)
     console.print(table, crop=False)
-
-
-def print_text(text: str) -> None:
-    """Print a line of text that the terminal may wrap."""
-    Console().print(text, highlight=False, soft_wrap=True)
