@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: help setup docs site dist demo pictures reproduce audit test test-slow test-fresh mutants test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
+.PHONY: help setup docs site dist demo pictures reproduce audit test test-slow test-fresh fuzz mutants test-gymnasium test-lowest test-ray test-tutorial lint format benchmark wheel-test clean clean-kernels
 
 help:  ## Show this list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -65,6 +65,9 @@ test-slow: setup  ## Run the slow tests: before a release, and after a change to
 test-fresh: setup  ## Run the tests of properties with examples that are drawn anew.
 	$(BIN)/python -m pytest -m 'hypothesis and not slow' --hypothesis-profile fresh
 
+fuzz: setup  ## Try random configurations and hostile files, ten minutes.
+	$(BIN)/python -m tests.fuzz
+
 mutants: setup  ## Break each line of the proof in a copy, and see a fast test fail; a quarter of an hour.
 	$(BIN)/python -m tests.mutants
 
@@ -102,8 +105,8 @@ dist: setup  ## Build and check the archives of a release; dist/.
 	$(BIN)/python -m build --outdir dist
 	$(BIN)/python -m twine check --strict dist/*
 
-wheel-test: setup  ## Build the archives, install the wheel for PYTHON elsewhere and use it there.
-	$(BIN)/python tests/wheel/run.py --python $(PYTHON)
+wheel-test: setup  ## Build the archives, install the wheel for PYTHON elsewhere and use it there; ARCHIVES=dist for built ones.
+	$(BIN)/python tests/wheel/run.py --python $(PYTHON) $(ARCHIVES:%=--archives %)
 
 test-lowest: setup  ## Use the wheel, and run the tests, with the lowest versions that are allowed; TORCH=2.13.0 for another torch.
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt uv

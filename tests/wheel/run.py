@@ -81,6 +81,7 @@ def main() -> None:
     """Build, install and use the wheel in a temporary folder."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--python", default=sys.executable, help="interpreter to install it for")
+    parser.add_argument("--archives", type=Path, help="folder of archives that are built already")
     parser.add_argument(
         "--lowest", action="store_true",
         help="take the lowest versions that pyproject.toml allows, and run the fast tests, too",
@@ -89,9 +90,12 @@ def main() -> None:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        call(sys.executable, "-m", "build", "--outdir", folder / "dist", ROOT, cwd=folder)
-        (wheel,) = (folder / "dist").glob("*.whl")
-        (source,) = (folder / "dist").glob("*.tar.gz")
+        archives = args.archives and args.archives.resolve()
+        if archives is None:
+            archives = folder / "dist"
+            call(sys.executable, "-m", "build", "--outdir", archives, ROOT, cwd=folder)
+        (wheel,) = archives.glob("*.whl")
+        (source,) = archives.glob("*.tar.gz")
         call(sys.executable, "-m", "twine", "check", "--strict", wheel, source, cwd=folder)
         check_wheel(wheel, ROOT)
         check_source(source, ROOT)
