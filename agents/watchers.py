@@ -138,41 +138,5 @@ class Honesty:
         ]
 
 
-class Summary:
-    """Honesty and refusals of a batch of episodes, in a few columns.
-
-    Columns:
-
-    - ``chi2_density``, ``chi2_speed``: as `Honesty` has them;
-    - ``n_met``, ``n_refused``: as `Contributions` has them; None where the release model keeps no
-      account of vehicles.
-    """
-
-    def __init__(self, process: QueryProcess) -> None:
-        """Prepare for the episodes of a process."""
-        self._honesty = Honesty(process)
-        has_accounts = isinstance(process.release, Capped | Paced)
-        self._contributions = Contributions(process) if has_accounts else None
-
-    def __call__(self) -> None:
-        """Follow the second that has passed."""
-        self._honesty()
-        if self._contributions is not None:
-            self._contributions()
-
-    def rows(self) -> list[Row]:
-        """See `dptse_env.evaluation.Watcher.rows`."""
-        names = ("chi2_density", "chi2_speed", "n_met", "n_refused")
-        rows = self._honesty.rows()
-        if self._contributions is not None:
-            counted = self._contributions.rows()
-            rows = [{**one, **other} for one, other in zip(rows, counted, strict=True)]
-        return [{name: row.get(name) for name in names} for row in rows]
-
-
-WATCHERS: dict[str, WatcherFactory] = {
-    "contributions": Contributions,
-    "honesty": Honesty,
-    "summary": Summary,
-}
+WATCHERS: dict[str, WatcherFactory] = {"contributions": Contributions, "honesty": Honesty}
 """Watchers by the names that cells give."""

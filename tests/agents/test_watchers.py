@@ -149,17 +149,3 @@ def test_the_warm_up_and_speeds_of_empty_segments_do_not_count():
     found = watcher.rows()[0]
     assert found["chi2_density"] == pytest.approx(1.0)
     assert found["chi2_speed"] == 0.0
-
-
-@pytest.mark.parametrize("privacy", [PACED, "printed"])
-def test_a_summary_is_of_honesty_and_refusals(privacy):
-    has_accounts = privacy != "printed"
-    more = ("honesty", *(("contributions",) if has_accounts else ()))
-    keywords = {"horizon": 120, "bandwidth": 2}
-    for row, whole in zip(
-        watch(privacy, ("summary",), **keywords), watch(privacy, more, **keywords), strict=True
-    ):
-        for name in ("chi2_density", "chi2_speed"):
-            assert row[name] == whole[name]
-        assert row["n_met"] == whole.get("n_met")
-        assert row["n_refused"] == whole.get("n_refused")
