@@ -91,7 +91,7 @@ class Study:
         return self.seeds if cell.seeds is None else cell.seeds
 
 
-def run(study: Study, place: Place, progress: bool = True) -> None:
+def run(study: Study, place: Place) -> None:
     """Play what the rows of a study lack, measure what its folder lacks, and write its report.
 
     Raises:
@@ -101,23 +101,23 @@ def run(study: Study, place: Place, progress: bool = True) -> None:
         ExecutorError: Workers died again and again.
         OSError: The folder cannot be written to.
     """
-    rows = play_study(study, place, progress)
+    rows = play_study(study, place)
     if study.follow is not None:
-        _play_missing(study, study.follow(rows, place), place, progress)
+        _play_missing(study, study.follow(rows, place), place)
     for name, measure in study.measures.items():
         if not (place.folder / name).exists():
             write_table(place.folder / name, measure(place))
     write_report(study, place.folder)
 
 
-def play_study(study: Study, place: Place, progress: bool = True) -> pl.DataFrame:
+def play_study(study: Study, place: Place) -> pl.DataFrame:
     """Play the cells of a study that the rows in a folder lack, and return all of its rows.
 
     Raises:
         ValueError, RecordingError, ExecutorError, OSError: See `run`.
     """
     place.folder.mkdir(parents=True, exist_ok=True)
-    _play_missing(study, study.cells, place, progress)
+    _play_missing(study, study.cells, place)
     return read_rows(study.name, place.folder)
 
 
@@ -144,7 +144,7 @@ def _footer(rows: pl.DataFrame) -> str:
     return f"Played by dptse-env {versions}. Differences are paired within equal numbers."
 
 
-def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: bool) -> None:
+def _play_missing(study: Study, cells: Sequence[Cell], place: Place) -> None:
     """Play the cells that rows of these numbers lack, and pack all rows into one file."""
     rows = read_rows(study.name, place.folder)
     present = are_present(rows)
@@ -165,7 +165,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
     for cell, _ in missing:
         cell.check()
     for corridor, seeds in dict.fromkeys((cell.config.corridor, seeds) for cell, seeds in missing):
-        record(corridor, seeds, place.records, progress=progress)
+        record(corridor, seeds, place.records, progress=True)
     folder = place.folder / PARTS
     threads = None if place.executor is this_process else 1
     if missing:
@@ -176,7 +176,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place, progress: b
         missing,
         lambda index, rows: write_table(_file_of(folder, missing[index][0].id), rows),
         size=lambda task: len(task[1]),
-        progress=progress and bool(missing),
+        progress=bool(missing),
         desc=study.name,
         unit="episode",
         mininterval=0.5,

@@ -18,5 +18,5 @@ def traces(tmp_path, monkeypatch):
 def expected(tmp_path_factory):
     """Rows of the study that no fault befalls."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    run(study(), Place(folder, this_process), progress=False)
+    run(study(), Place(folder, this_process))
     return rows_of(folder)

@@ -67,4 +67,4 @@ def rows_of(folder):
 
 if __name__ == "__main__":
     executor = make_executor("ray" if len(sys.argv) > 2 else "local", 2, *sys.argv[2:])
-    run(study(), Place(Path(sys.argv[1]), executor), progress=False)
+    run(study(), Place(Path(sys.argv[1]), executor))

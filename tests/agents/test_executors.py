@@ -24,10 +24,6 @@ from dptse_env.utils.registry import MissingExtraError
 from tests.helpers import ROOT, wait_for
 
 
-def run(executor, work, tasks):
-    return run_in_order(executor, work, tasks, progress=False)
-
-
 def reciprocal(number):
     return 1 / number
 
@@ -35,18 +31,18 @@ def reciprocal(number):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_tasks_come_back_with_their_results_and_errors_as_they_are(workers):
     executor = make_executor("local", workers)
-    assert run(executor, operator.neg, range(300, 306)) == [-k for k in range(300, 306)]
-    assert run(executor, operator.neg, []) == []
-    assert run(executor, operator.neg, [1, 1, 2, 1]) == [-1, -1, -2, -1]
+    assert run_in_order(executor, operator.neg, range(300, 306)) == [-k for k in range(300, 306)]
+    assert run_in_order(executor, operator.neg, []) == []
+    assert run_in_order(executor, operator.neg, [1, 1, 2, 1]) == [-1, -1, -2, -1]
     with pytest.raises(ZeroDivisionError):
-        run(executor, reciprocal, [1, 0, 2])
+        run_in_order(executor, reciprocal, [1, 0, 2])
 
 
 def test_results_are_in_the_order_of_the_tasks_whichever_is_done_first():
     def backwards(work, tasks):
         yield from list(enumerate(map(work, tasks)))[::-1]
 
-    assert run(backwards, operator.neg, [1, 2, 3]) == [-1, -2, -3]
+    assert run_in_order(backwards, operator.neg, [1, 2, 3]) == [-1, -2, -3]
 
 
 def test_a_result_is_handed_over_before_the_next_task_begins_and_the_bar_has_its_size():
@@ -80,10 +76,10 @@ def interrupted(number):
 
 def test_there_are_as_many_processes_as_asked_for_and_they_leave_interrupts_to_this_one(tmp_path):
     executor = make_executor("local", 2)
-    places = run(executor, meet, [tmp_path] * 8)
+    places = run_in_order(executor, meet, [tmp_path] * 8)
     assert {str(place) for place in places} == {each.name for each in tmp_path.iterdir()}
     assert len({*places} - {os.getpid()}) == 2
-    assert run(executor, interrupted, range(2)) == [0, 1]
+    assert run_in_order(executor, interrupted, range(2)) == [0, 1]
 
 
 def n_warnings(module):
@@ -102,9 +98,9 @@ def test_processes_have_one_thread_and_do_not_repeat_what_this_one_has_said(monk
     said.set()
     monkeypatch.setattr("agents.executors.compiling_is_said", said)
     executor = make_executor("local", 2)
-    assert run(executor, n_warnings, ["dptse_env.config", "torch"]) == [0, 1]
-    assert run(executor, is_said, [1]) == [True]
-    assert run(executor, os.getenv, ["OMP_NUM_THREADS"]) == ["1"]
+    assert run_in_order(executor, n_warnings, ["dptse_env.config", "torch"]) == [0, 1]
+    assert run_in_order(executor, is_said, [1]) == [True]
+    assert run_in_order(executor, os.getenv, ["OMP_NUM_THREADS"]) == ["1"]
 
 
 def test_a_task_whose_worker_died_runs_again_three_times(monkeypatch):
@@ -124,17 +120,17 @@ def test_a_task_whose_worker_died_runs_again_three_times(monkeypatch):
 
     pool, executor = Mortal(), make_executor("local", 2)
     monkeypatch.setattr(loky, "get_reusable_executor", lambda *_, **__: pool)
-    assert run(executor, abs, [-1, -2]) == [1, 2]  # three times after the last result
+    assert run_in_order(executor, abs, [-1, -2]) == [1, 2]  # three times after the last result
     pool.deaths[-2] = 4
     with pytest.raises(ExecutorError, match="a task was lost 4 times"):
-        run(executor, abs, [1, -2])
+        run_in_order(executor, abs, [1, -2])
     assert pool.deaths[-2] == 0
 
 
 PROGRAM = """
 import sys
 from agents.executors import make_executor, run_in_order
-run_in_order(make_executor("local", 2), exec, sys.argv[1:], progress=False)
+run_in_order(make_executor("local", 2), exec, sys.argv[1:])
 """
 TASK = """
 import os, pathlib, time
@@ -162,7 +158,7 @@ def test_what_still_runs_is_ended_where_another_fails_or_the_program_is_killed(t
 
 
 def test_one_worker_is_the_calling_process():
-    assert run(make_executor("local", 1), lambda _: os.getpid(), [0]) == [os.getpid()]
+    assert run_in_order(make_executor("local", 1), lambda _: os.getpid(), [0]) == [os.getpid()]
     for workers in (0, 1.5):
         with pytest.raises(ValueError, match="workers must be an integer >= 1"):
             make_executor("local", workers)

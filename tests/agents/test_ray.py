@@ -46,10 +46,6 @@ def add_nodes(cluster, traces, n):
         cluster.add_node(num_cpus=1, env_vars={TRACES: str(traces)})
 
 
-def calls(executor, work, tasks):
-    return run_in_order(executor, work, tasks, progress=False)
-
-
 def raise_type(kind):
     raise kind("as it is")
 
@@ -61,20 +57,20 @@ def read(path):
 def test_errors_are_those_of_the_task(cluster, tmp_path):
     cluster.add_node(num_cpus=2)
     executor = make_executor("ray", 1, cluster.address)
-    assert calls(executor, operator.neg, range(20)) == [-k for k in range(20)]
+    assert run_in_order(executor, operator.neg, range(20)) == [-k for k in range(20)]
     with pytest.raises(KeyError, match="as it is"):
-        calls(executor, raise_type, [KeyError])
+        run_in_order(executor, raise_type, [KeyError])
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        calls(executor, read, [str(tmp_path / "nowhere")])
+        run_in_order(executor, read, [str(tmp_path / "nowhere")])
     with pytest.raises(ExecutorError, match="a task was lost 4 times"):
-        calls(executor, os._exit, [1])
-    assert calls(executor, abs, [-1]) == [1]
+        run_in_order(executor, os._exit, [1])
+    assert run_in_order(executor, abs, [-1]) == [1]
 
 
 def test_nodes_make_the_records_that_they_lack(cluster, tmp_path, expected):
     for k in (1, 2):
         cluster.add_node(num_cpus=1, env_vars={CACHE_VARIABLE: str(tmp_path / f"cache-{k}")})
-    run(study(), Place(tmp_path, make_executor("ray", 1, cluster.address)), progress=False)
+    run(study(), Place(tmp_path, make_executor("ray", 1, cluster.address)))
     assert rows_of(tmp_path).equals(expected)
     for k in (1, 2):
         records = (tmp_path / f"cache-{k}").glob("*/*/0*.safetensors")
@@ -83,7 +79,7 @@ def test_nodes_make_the_records_that_they_lack(cluster, tmp_path, expected):
 
 def test_a_killed_worker(cluster, traces, tmp_path, expected):
     add_nodes(cluster, traces, 2)
-    run(study(), Place(tmp_path, make_executor("ray", 1, cluster.address)), progress=False)
+    run(study(), Place(tmp_path, make_executor("ray", 1, cluster.address)))
     assert (traces / "killed").exists()
     assert rows_of(tmp_path).equals(expected)
 
@@ -92,7 +88,7 @@ def test_a_removed_node(cluster, traces, tmp_path, expected):
     add_nodes(cluster, traces, 1)
     leaving = cluster.add_node(num_cpus=1, env_vars={TRACES: str(traces)})
     executor = make_executor("ray", 1, cluster.address)
-    job = threading.Thread(target=run, args=(study(), Place(tmp_path, executor), False))
+    job = threading.Thread(target=run, args=(study(), Place(tmp_path, executor)))
     job.start()
     # Here, as Ray starts and ends nodes in the main thread alone.
     wait_for(lambda: len(list(traces.glob("played-*"))) >= 2)

@@ -47,7 +47,7 @@ def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
     folder = tmp_path / "a[1]"  # as a pattern it does not match itself
     calls, place = [], Place(folder, this_process)
     first = small(calls)
-    run(first, place, progress=False)
+    run(first, place)
     rows = read_rows("small", folder).sort("bandwidth", "traffic_seed")
     expected = [row for cell in first.cells for row in play(cell, first.seeds)]
     assert rows.select("bandwidth", "traffic_seed").rows() == [
@@ -64,19 +64,19 @@ def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
 
 def test_rows_of_equal_numbers_count_as_played_and_others_do_not(tmp_path, monkeypatch):
     place, first = Place(tmp_path, this_process), small()
-    run(first, place, progress=False)
+    run(first, place)
     rows, own = rows_of(tmp_path), versions.code_version()
     old = rows.with_columns(version=pl.lit("0.1.0"), rmse_density=pl.lit(7.0))
     write_table(tmp_path / "rows.parquet", old)
     with monkeypatch.context() as declared:
         declared.setattr(versions, "equal_digests", lambda: {versions.digest(): "0.1.0"})
-        run(replace(first, cells=(*first.cells, cell(3))), place, progress=False)
+        run(replace(first, cells=(*first.cells, cell(3))), place)
         tables = (tmp_path / "tables.md").read_text("utf-8")
     assert read_rows("small", tmp_path)["version"].to_list() == ["0.1.0"] * 4 + [own] * 2
     assert "| 1 | 7.000000 |" in tables
     assert f"by dptse-env 0.1.0 (4 episodes) = {own} (2 episodes). " in tables
     with pytest.warns(UserWarning, match=r"2 cells .* again: .* 0\.1\.0, whose numbers are not"):
-        run(first, place, progress=False)
+        run(first, place)
     assert read_rows("small", tmp_path)["version"].to_list() == ["0.1.0"] * 4 + [own] * 6
     tables = (tmp_path / "tables.md").read_text("utf-8")
     assert f"| 1 | {rows.filter(bandwidth=1)['rmse_density'].mean():.6f} |" in tables
@@ -93,7 +93,7 @@ def test_cells_may_follow_from_rows(tmp_path):
         keywords = {**KEYWORDS, "bandwidth": chosen}
         return [Cell(SHORT, "static", keywords, {"bandwidth": 10 + chosen}, seeds=(2005,))]
 
-    run(small(follow=follow), Place(tmp_path, this_process), progress=False)
+    run(small(follow=follow), Place(tmp_path, this_process))
     assert rows_of(tmp_path)["bandwidth"].to_list()[-1] == 12
     assert rows_of(tmp_path)["traffic_seed"].to_list()[-1] == 2005
 
@@ -107,11 +107,11 @@ def test_bad_cells_are_refused_before_the_first_is_played(tmp_path):
         (replace(good, keywords={"cargo": 1}), "cargo"),
     ]:
         with pytest.raises(ValueError, match=message):
-            run(small(cells=(good, bad)), Place(tmp_path, this_process), progress=False)
+            run(small(cells=(good, bad)), Place(tmp_path, this_process))
         assert not (tmp_path / "rows").exists()
     bad = replace(good, labels={"reward": 1})
     with pytest.raises(ValueError, match=r"labels must differ .* got 'reward'"):
-        run(small(cells=(bad,)), Place(tmp_path, this_process), progress=False)
+        run(small(cells=(bad,)), Place(tmp_path, this_process))
 
 
 def test_broken_tables_and_those_of_another_study_are_refused(tmp_path):
@@ -183,7 +183,7 @@ def test_pairs_are_of_equal_numbers(monkeypatch):
 
 @pytest.mark.slow
 def test_a_killed_worker_loses_nothing(tmp_path, traces, expected):
-    run(study(), Place(tmp_path, make_executor("local", 2)), progress=False)
+    run(study(), Place(tmp_path, make_executor("local", 2)))
     assert (traces / "killed").exists()
     assert rows_of(tmp_path).equals(expected)
 

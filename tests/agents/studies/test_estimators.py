@@ -98,7 +98,7 @@ def test_it_plays_and_reports(tmp_path):
     found = (study.world_cell("ShortHighway-v0", name) for name in study.MOVED[:2])
     cells = [replace(each, keywords={**each.keywords, "horizon": 90}, seeds=None) for each in found]
     small = replace(STUDY, cells=tuple(cells), seeds=(2000, 2001))
-    run(small, Place(tmp_path, this_process), progress=False)
+    run(small, Place(tmp_path, this_process))
     rows = read_rows("estimators", tmp_path)
     assert len(rows) == 4
     error = -1000.0 * rows.filter(estimator="ekf")["reward"].mean()

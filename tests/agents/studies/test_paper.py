@@ -100,7 +100,7 @@ def test_two_cells_are_played_measured_and_reported(tmp_path, monkeypatch):
     base = [paper.labels_of("random_walk", setting) for setting in (first, second)]
     cells = tuple(cell for cell in CELLS if cell.labels in base)
     place = Place(tmp_path, this_process)
-    run(replace(STUDY, cells=cells, seeds=(2000, 2001)), place, progress=False)
+    run(replace(STUDY, cells=cells, seeds=(2000, 2001)), place)
     text = (tmp_path / "tables.md").read_text("utf-8")
     assert ["[" in each for each in entries(text, "random walk")] == [True, True, False, False]
     assert read_table(tmp_path / paper.RUN_TIME)["seconds"].min() > 0.0

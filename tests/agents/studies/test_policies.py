@@ -234,7 +234,7 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     kept = tmp_path / "trainings" / "short" / "qr-dqn" / "0" / "checkpoint.pt"
     before = kept.stat().st_mtime_ns
     shutil.rmtree(tmp_path / "trainings" / "short" / "plackett-luce")  # as one that was killed
-    run(policies.study(0.05, "0:2"), place, progress=False)
+    run(policies.study(0.05, "0:2"), place)
     assert kept.stat().st_mtime_ns == before
     curves = read_table(tmp_path / policies.CURVES)
     seeds = curves.group_by("policy").agg(pl.col("training_seed").n_unique())

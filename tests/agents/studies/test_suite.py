@@ -45,7 +45,7 @@ def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded")
     cells = [dataclasses.replace(each, policy=policy, labels={"name": name, "policy": policy})
              for name, each in SMALL.items() for policy in ("static", ZERO, ONE)]  # fmt: skip
-    play_study(Study("suite", tuple(cells), (), report), Place(folder, this_process), False)
+    play_study(Study("suite", tuple(cells), (), report), Place(folder, this_process))
     return folder
 
 
