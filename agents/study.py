@@ -131,17 +131,17 @@ def write_report(study: Study, folder: Path) -> None:
     rows = read_rows(study.name, folder)
     if rows.is_empty():
         raise FileNotFoundError(f"{folder / ROWS} is not there: run the study without --report")
-    content = study.report(rows, folder).strip()
-    write_atomically(folder / TABLES, f"{content}\n\n{_footer(rows)}\n")
+    write_tables(folder, study.report(rows, folder).strip(), rows)
 
 
-def _footer(rows: pl.DataFrame) -> str:
-    """Return where the rows of a report come from."""
+def write_tables(folder: Path, content: str, rows: pl.DataFrame) -> None:
+    """Write Markdown about some rows, with a last line on where they come from."""
     equal: dict[str, list[str]] = {}
     for version, n in rows.group_by("version").len().sort("version").iter_rows():
         equal.setdefault(numbers_of(version), []).append(f"{version} ({n:,} episodes)")
     versions = ", ".join(map(" = ".join, equal.values()))
-    return f"Played by dptse-env {versions}. Differences are paired within equal numbers."
+    origin = f"Played by dptse-env {versions}. Differences are paired within equal numbers."
+    write_atomically(folder / TABLES, f"{content}\n\n{origin}\n")
 
 
 def _play_missing(study: Study, cells: Sequence[Cell], place: Place) -> None:

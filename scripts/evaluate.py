@@ -31,8 +31,7 @@ from agents.policies import find_policy, policy_name
 from agents.seeds import seed_kind
 from agents.statistics import Interval, mean_interval
 from agents.studies import suite
-from agents.study import OWN, PARTS, ROWS, TABLES, Study, play_study, read_rows
-from agents.study import run as run_study
+from agents.study import OWN, PARTS, ROWS, TABLES, Place, Study, play_study, write_tables
 from agents.tables import (
     DENSITY,
     ERROR,
@@ -50,7 +49,7 @@ from dptse_env.policies import DETERMINISTIC
 from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import require_output
-from dptse_env.utils.validation import require, require_name
+from dptse_env.utils.validation import integer, require, require_name
 from scripts.cli import (
     Command,
     Environment,
@@ -112,8 +111,9 @@ def main(args: Args) -> None:
         enter(args, args.suite or tuple(suite.CELLS))
 
 
-def rows_of(cells: Sequence[Cell], rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of cells by this version; a folder may have others, of earlier runs."""
+def play(name: str, cells: tuple[Cell, ...], seeds: tuple[int, ...], place: Place) -> pl.DataFrame:
+    """Return the rows of cells; a folder may have others, of earlier runs."""
+    rows = play_study(Study(name, cells, seeds, lambda rows, folder: ""), place)
     return rows.filter(pl.col("cell").is_in([cell.id for cell in cells]), are_present(rows))
 
 
@@ -144,7 +144,10 @@ def compare(args: Args) -> None:
     """Record what is missing, evaluate, and write tables, rows and figures."""
     title, cells = make_cells(args)
     seeds = parse_seeds(args.test_seeds, "test_seeds")
+    integer("seed", args.seed, 0)
     title += f", {len(seeds)} episode{'s' * (len(seeds) > 1)} on {seed_kind(seeds)} traffic"
+    title += f", seed {args.seed}" if args.seed else ""
+    title += f", actions {args.acts}" if args.acts else ""
     for cell in cells:
         cell.check()
     # The tables are written last: without them an evaluation goes on.
@@ -152,28 +155,23 @@ def compare(args: Args) -> None:
     figures = (ERRORS, MAPS, *([PAGE] if args.html else []))
     require_output(args.output, figures, own=OWN, force=args.force)
 
-    def report(rows: pl.DataFrame, folder: Path) -> str:
-        scores = score(rows_of(cells, rows), cells, args.reference)
-        draw_scores(folder / ERRORS, title, scores, cells)
-        draw_traffic(args, title, scores, cells)
-        header, lines = make_rows(scores, args.reference)
-        table = markdown([each.replace("\n", " ") for each in header], lines)
-        return f"# {title}\n\n{legend(seeds)}.\n\n{table}"
-
     place = args.place(args.output)
     if args.force:
         for name in (ROWS, TABLES, *figures):
             (args.output / name).unlink(missing_ok=True)
         shutil.rmtree(args.output / PARTS, ignore_errors=True)
-    run_study(Study("evaluation", cells, seeds, report), place)
-    rows = rows_of(cells, read_rows("evaluation", args.output))
+    rows = play("evaluation", cells, seeds, place)
     scores = score(rows, cells, args.reference)
+    draw_scores(args.output / ERRORS, title, scores, cells)
+    draw_traffic(args, title, scores, cells)
     header, lines = make_rows(scores, args.reference)
-    table = make_table("", *header, left=2, rows=lines)
+    table = markdown([each.replace("\n", " ") for each in header], lines)
+    write_tables(args.output, f"# {title}\n\n{legend(seeds)}.\n\n{table}", rows)
     page = f", {PAGE} (for a browser)" if args.html else ""
     args.answer(
         {"title": title, "reference": args.reference, "rows": [as_json(each) for each in scores]},
-        f"{title}\n{legend(seeds)}", table, *verdicts(rows, scores, cells),
+        f"{title}\n{legend(seeds)}", make_table("", *header, left=2, rows=lines),
+        *verdicts(rows, scores, cells),
         f"wrote {args.output}/: {TABLES}, {ERRORS} (errors), {MAPS} (queries){page}",
     )  # fmt: skip
 
@@ -192,7 +190,7 @@ def make_cells(args: Args) -> tuple[str, tuple[Cell, ...]]:
     policies: dict[str, str] = {}
     for source in (*(args.policies or OBSERVATION_SCHEDULES), args.reference):
         name = policy_name(source)
-        require(policies.setdefault(name, source) == source, "policies", "of other names", name)
+        require(policies.setdefault(name, source) == source, "policies", "of different names", name)
     cells = []
     for estimator in args.estimators or (str(config.estimator),):
         own = {**given, "estimator": estimator} if args.estimators else given
@@ -376,9 +374,8 @@ def enter(args: Args, names: Sequence[str]) -> None:
     place, recorded = args.place(folder), suite.recorded_rows()
     if left_out:
         args.remark(left_out)
-    study = Study("suite", cells, suite.SEEDS, lambda rows, folder: "")
     # The folder may have rows of this policy under another name.
-    own = rows_of(cells, play_study(study, place)).with_columns(policy=pl.lit(entry))
+    own = play("suite", cells, suite.SEEDS, place).with_columns(policy=pl.lit(entry))
     rows: pl.DataFrame = pl.concat([recorded, *others, own], how="diagonal_relaxed")
     rows = rows.unique(("policy", "name", "traffic_seed"), keep="last")
     card = suite.make_card(rows, entry, cells)

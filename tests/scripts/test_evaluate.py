@@ -161,7 +161,7 @@ def test_policies_and_schedules_play_what_gym_make_makes(tmp_path):
         "999:1001", "--seed", "5", "--output", tmp_path / "out", "--workers", "1",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "2 episodes on mixed traffic" in done.stdout
+    assert "2 episodes on mixed traffic, seed 5\n" in done.stdout
     for name, action in (("oldest-first", "mask"), ("run/best", "slots")):
         assert name in done.stdout
         env = gym.make(SHORT, traffic_seeds="999:1001", action=action)
@@ -231,6 +231,7 @@ def test_estimators_and_keywords_reach_the_environment():
         (["--policies", "best"], "schedule must be one of"),
         (["--reference", "nobody"], "'nobody'"),
         (["--estimators", "kf"], "estimator must be one of"),
+        (["--seed", "-1"], "seed must be"),
         # The first could be played.
         (["--env", SURE, "--estimators", "ekf", "mhe"], "estimator_settings.process_noise[0] must"),
         (["--test-seeds", "2000:2000"], "test_seeds must be"),
