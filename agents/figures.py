@@ -11,8 +11,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import FixedLocator, NullLocator
@@ -47,7 +45,6 @@ def save_figure(figure: Figure, path: Path, title: str) -> None:
     folded = fill(title, int(13 * figure.get_figwidth()))
     figure.suptitle(folded, x=0.01, ha="left", fontsize=10)
     path.parent.mkdir(parents=True, exist_ok=True)
-    FigureCanvasAgg(figure)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png")
 
@@ -93,11 +90,18 @@ def add_legend(figure: Figure, axes: Iterable[Axes], columns: int = 5) -> None:
         )
 
 
-def set_log_ticks(axis: Axis, ticks: Sequence[float]) -> None:
-    """Put plain numbers at some ticks of a logarithmic axis, and nothing between them."""
-    axis.set_major_locator(FixedLocator(list(ticks)))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter("{x:g}")
+def set_log(axis: Axes, x: Sequence[float] = (), y: Sequence[float] = ()) -> None:
+    """Make an axis that is given ticks logarithmic, with plain numbers there and nothing between.
+
+    Those for errors are `ERROR_TICKS`.
+    """
+    both = (axis.set_xscale, axis.xaxis, x), (axis.set_yscale, axis.yaxis, y)
+    for set_scale, side, ticks in both:
+        if ticks:
+            set_scale("log")
+            side.set_major_locator(FixedLocator(list(ticks)))
+            side.set_minor_locator(NullLocator())
+            side.set_major_formatter("{x:g}")
 
 
 def spread(intervals: Sequence[Interval]) -> FloatArray:
@@ -143,8 +147,7 @@ def draw_errors(
                 draw_dot(axis, interval, shift - place, colours[name], name)
         axis.set_xlabel(fill(panel, 72 // len(panels)), fontsize=9)
         if log:
-            axis.set_xscale("log")
-            set_log_ticks(axis.xaxis, ERROR_TICKS)
+            set_log(axis, ERROR_TICKS)
         axis.margins(x=0.2)
         add_frame(axis, "x")
     add_legend(figure, axes[:1])
@@ -292,14 +295,6 @@ def draw_rule(axis: Axes, rule: str, error: float) -> None:
     axis.annotate(
         rule, (1.0, error), xycoords=("axes fraction", "data"), fontsize=7, ha="right", va="bottom"
     )
-
-
-def set_log_axes(axis: Axes, ticks: Sequence[float]) -> None:
-    """Make both axes logarithmic with plain numbers, the upright one for errors."""
-    axis.set_xscale("log")
-    set_log_ticks(axis.xaxis, ticks)
-    axis.set_yscale("log")
-    set_log_ticks(axis.yaxis, ERROR_TICKS)
 
 
 def shifted(places: Sequence[float], share: float, log: bool) -> FloatArray:

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 from agents.environments import OTHER_DRIVERS
 from agents.figures import (
+    ERROR_TICKS,
     LABELS,
     Look,
     draw_curve,
@@ -28,7 +29,7 @@ from agents.figures import (
     finish_figure,
     make_figure,
     save_measured,
-    set_log_axes,
+    set_log,
 )
 from agents.play import Cell
 from agents.statistics import Interval, mean_interval
@@ -379,7 +380,7 @@ def draw_arms(rows: pl.DataFrame) -> Figure:
         for name, (arm, look) in arms.items():
             cells = [sensed(release, estimator, share, arm) for share in SHARES.values()]
             draw_curve(axis, percent, [mean(rows, each, ERROR) for each in cells], look, name)
-        set_log_axes(axis, percent)
+        set_log(axis, percent, ERROR_TICKS)
         axis.set_title(f"{release}, {LABELS[estimator]}", fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel("connected vehicles [%]", fontsize=8)

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 
 from agents.environments import make_config, quietly
 from agents.figures import (
+    ERROR_TICKS,
     LABELS,
     Look,
     draw_curve,
@@ -29,8 +30,7 @@ from agents.figures import (
     finish_figure,
     make_figure,
     save_measured,
-    set_log_axes,
-    set_log_ticks,
+    set_log,
 )
 from agents.play import Cell
 from agents.statistics import Interval, mean_interval
@@ -436,7 +436,7 @@ def draw_price(rows: pl.DataFrame) -> Figure:
             means = [mean(rows, each.labels, metric) for each in cells]
             draw_curve(axis, EPSILONS, means, look, protection.replace("`", ""))
         draw_level(axis, mean(rows, priced("open_loop").labels, metric), label="open loop")
-        set_log_axes(axis, EPSILONS)
+        set_log(axis, EPSILONS, ERROR_TICKS)
         axis.set_title(LABELS[name], fontsize=9, loc="left")
         axis.set_xlabel("ε claimed")
         axis.set_ylabel(error_label(metric))
@@ -452,8 +452,7 @@ def draw_claimed(_: pl.DataFrame) -> Figure:
         true = [true_epsilon(line, each) for each in EPSILONS]
         colour = LOOKS[line.split(": ")[0]].colour
         axis.plot(EPSILONS, true, style, color=colour, label=line.replace("`", ""))
-    set_log_axes(axis, EPSILONS)
-    set_log_ticks(axis.yaxis, [10.0**k for k in range(-1, 7)])
+    set_log(axis, EPSILONS, [10.0**k for k in range(-1, 7)])
     axis.set_xlabel("ε claimed")
     axis.set_ylabel("ε true")
     return finish_figure(figure, columns=2)

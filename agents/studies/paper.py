@@ -40,7 +40,7 @@ from agents.figures import (
     finish_figure,
     make_figure,
     save_measured,
-    set_log_ticks,
+    set_log,
     shifted,
 )
 from agents.page import watch
@@ -445,11 +445,7 @@ def draw_sweep(rows: pl.DataFrame, field: str, metrics: Sequence[str], columns: 
             draw_curve(axis, places, means, ESTIMATOR_LOOKS[name], LABELS[name])
         axis.set_xlabel(AXES[field])
         if field != "bandwidth":
-            axis.set_xscale("log")
-            set_log_ticks(axis.xaxis, SWEEPS[field])
-        if field == "epsilon":
-            axis.set_yscale("log")
-            set_log_ticks(axis.yaxis, ERROR_TICKS)
+            set_log(axis, SWEEPS[field], ERROR_TICKS if field == "epsilon" else ())
     return finish_figure(figure)
 
 
@@ -486,8 +482,7 @@ def draw_times(rows: pl.DataFrame) -> Figure:
     for place, name in enumerate(PAPER_SECONDS):
         axis.plot(place, 1e3 * PAPER_SECONDS[name], "kx", label="the paper")
     axis.set_xticks(places, [LABELS[name] for name in ESTIMATORS])
-    axis.set_yscale("log")
-    set_log_ticks(axis.yaxis, (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0))
+    set_log(axis, y=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0))
     axis.set_ylabel("time of a step [ms]")
     return finish_figure(figure, columns=2)
 

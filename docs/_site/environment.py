@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from agents.figures import (
     COLOURS,
+    ERROR_TICKS,
     Look,
     add_frame,
     draw_curve,
@@ -21,7 +22,7 @@ from agents.figures import (
     finish_figure,
     make_figure,
     save_figure,
-    set_log_axes,
+    set_log,
 )
 from agents.page import watch
 from agents.play import Cell
@@ -115,7 +116,7 @@ def draw_epsilon() -> Figure:
             cells = [paid(release=release, epsilon=each).labels for each in CURVE]
             draw_curve(axis, CURVE, [mean(rows, each, metric) for each in cells], look, release)
         draw_level(axis, mean(rows, paid(release="exact").labels, metric), "no noise")
-        set_log_axes(axis, CURVE)
+        set_log(axis, CURVE, ERROR_TICKS)
         axis.set_xlabel("ε at δ = 0.05", fontsize=9)
         axis.set_ylabel(error_label(metric), fontsize=9)
     return finish_figure(figure)

@@ -35,7 +35,7 @@ from agents.figures import (
     finish_figure,
     make_figure,
     save_figure,
-    set_log_ticks,
+    set_log,
     shifted,
 )
 from agents.play import Cell
@@ -473,8 +473,7 @@ def draw_gains(rows: pl.DataFrame, path: Path) -> None:
                 continue
             draw_curve(axis, shifted(shares, 0.01 * (k - 1), log=True), found, look, label)
         axis.axhline(0.0, color=GREY, linewidth=0.8)
-        axis.set_xscale("log")
-        set_log_ticks(axis.xaxis, [round(share, 1) for share in shares])
+        set_log(axis, [round(share, 1) for share in shares])
         axis.set_xlabel("segments queried a second [%]", fontsize=8)
     title = f"Gain of choosing queries over {ROUND_ROBIN}; 95 % intervals"
     save_figure(finish_figure(figure, columns=4), path, title)
