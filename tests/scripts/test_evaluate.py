@@ -16,11 +16,13 @@ from agents import study
 from agents.study import read_rows
 from dptse_env.estimators.simple import RandomWalk
 from dptse_env.evaluation import evaluate
+from dptse_env.importers.fields import import_field
 from dptse_env.sb3 import load_policy
 from dptse_env.schedules import OBSERVATION_SCHEDULES
 from scripts import evaluate as evaluate_script
 from scripts.evaluate import Args, make_cells
 from tests.helpers import SHORT, save_untrained
+from tests.importers.test_fields import ROAD, SPLITS, write
 from tests.scripts.commands import refused, run_command
 
 WALK = f'{SHORT} {{"estimator": "random_walk"}}'
@@ -188,6 +190,34 @@ def test_estimators_come_in_the_order_of_their_errors(tmp_path):
     for (estimator, policy), row in zip(errors, rows, strict=True):
         less = errors[estimator, policy] - errors[estimator, "round-robin"]
         assert row["differences"]["error"]["mean"] == pytest.approx(less)
+
+
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+def test_estimators_are_judged_on_a_measured_field(tmp_path):
+    tests = [each._replace(share=float(each.name == "test")) for each in SPLITS]
+    import_field(write(tmp_path), ROAD, tmp_path / "road", tests, 100)
+
+    def words(**privacy):
+        own = {"corridor": str(tmp_path / "road" / "road.toml"), "bandwidth": 2, **privacy}
+        env = f"dptse_env:dptse/PaperHighway-v0 {json.dumps(own)}"
+        return [
+            "evaluate", "--env", env, "--test-seeds", "2000:2004", "--policies", "round-robin",
+            "--estimators", "random_walk", "ekf", "--workers", "1", "--json",
+        ]  # fmt: skip
+
+    def means(epsilon):
+        given = words(privacy="corrected", epsilon=epsilon, parameters="w99-3lane")
+        found = json.loads(run_command(*given, "--output", tmp_path / f"{epsilon}").stdout)
+        assert found["title"].startswith("PaperHighway-v0, road road ")
+        assert "4 episodes on test traffic" in found["title"]
+        return {row["estimator"]: row["means"] for row in found["rows"]}
+
+    noisy, exact = means(1.0), means(1e4)
+    for name in ("random_walk", "ekf"):
+        assert exact[name]["error"]["mean"] < 0.5 * noisy[name]["error"]["mean"]
+        assert 0.1 < noisy[name]["chi2_density"]["mean"] < 10.0
+    refusal = refused(*words(privacy="paced"), "--output", tmp_path / "no")
+    assert "on a road of measured fields, got 'paced'" in refusal
 
 
 class Sure(RandomWalk):
