@@ -56,7 +56,9 @@ def learn(run: Run) -> None:
     if kept is not None and run.done(run.steps) >= 1.0:
         return
     world, per_second = plan.worlds[0], plan.actions_per_step
-    given = {**world.keywords, **run.keywords, **settings.episode(world.config)}
+    most = min(world.config.horizon_steps, world.config.corridor.conditions.duration // 2)
+    episode = {"horizon": min(settings.horizon, most), "random_start": True}
+    given = {**world.keywords, **run.keywords, **episode}
     episodes = SB3VecEnv(
         gym.make_vec(world.env, num_envs=settings.n_envs, **given, autoreset_mode="SameStep"),
         settings.replicas,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -12,17 +11,17 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.environments import make_vector
+from agents.environments import heading, make_vector
 from agents.figures import COLOURS, draw_rule, finish_figure, make_figure, save_figure
 from agents.files import write_json
 from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
+from agents.training.plan import TrainingPlan
 from agents.training.run_files import Row, TrainingFolder
-from agents.training.settings import PlackettLuceSettings, TrainingPlan
+from agents.training.settings import PlackettLuceSettings
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import ActingPolicy, save_policy
 from dptse_env.traffic import Records
@@ -33,7 +32,7 @@ from dptse_env.vector_env import SensorQueryVectorEnv
 POLICY, BEST = "policy.safetensors", "best.safetensors"
 """The last policy, and the one of least error in validation."""
 
-CURVE, RULES_FILE, TENSORBOARD = "curve.png", "rules.json", "tensorboard"
+CURVE, RULES_FILE = "curve.png", "rules.json"
 
 RULES = (
     "round-robin", "stale-variance", "largest-deviation", "speed-front", "expected-reduction",
@@ -102,8 +101,6 @@ class Run(TrainingFolder):
         seconds = round(time.process_time() - self._begun, 1)
         row = {"update": len(self.rows), "steps": steps, "seconds": seconds, **values}
         self.append(row)
-        if self._board is not None:
-            self._board.write(row, dict.fromkeys(row, ()), steps)
         self.show(steps)
 
     def validate(
@@ -139,7 +136,8 @@ class Run(TrainingFolder):
     def finish(self) -> None:
         """Write the curve, and draw it with the rules as lines."""
         self.write_curve()
-        title = f"{self.plan.algorithm.name} in {self.plan.worlds[0]}, validation traffic"
+        world = self.plan.worlds[0]
+        title = f"{self.plan.algorithm.name}, validation: {heading(world.env, world.config)}"
         save_figure(draw_curve(self.rows, self.rules), self.folder / CURVE, title)
 
     def _save(self, name: str, policy: BasePolicy, row: Row, scaled: VecNormalize | None) -> None:
@@ -166,12 +164,6 @@ class Run(TrainingFolder):
             normalisation=scaled,
             deterministic=row["validation"] <= row["validation_drawn"],
         )
-
-    @cached_property
-    def _board(self) -> TensorBoardOutputFormat | None:
-        if importlib.util.find_spec("tensorboard") is None:
-            return None
-        return TensorBoardOutputFormat(str(self.folder / TENSORBOARD))
 
     @cached_property
     def _environments(self) -> list[SensorQueryVectorEnv]:

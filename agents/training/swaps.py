@@ -29,8 +29,8 @@ import torch
 from torch import Tensor
 
 from agents.seeds import training_seed
-from agents.training.settings import SwapRounds, first_second
-from dptse_env.evaluation import Policy
+from agents.training.settings import SwapRounds
+from dptse_env.evaluation import WARM_UP, Policy
 from dptse_env.process import QueryProcess
 from dptse_env.sb3 import RoadPolicy
 from dptse_env.utils.arrays import Action, AnyArray, FloatArray, IntArray, Observation
@@ -69,6 +69,11 @@ class Swaps:
     dropped: IntArray
     gain: FloatArray
     spent: FloatArray
+
+
+def first_second(horizon: int) -> int:
+    """Return the earliest second of an episode of ``horizon`` seconds in which swaps are tried."""
+    return min(WARM_UP, horizon // 4)
 
 
 def try_swaps(

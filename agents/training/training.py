@@ -15,10 +15,11 @@ from agents.files import write_json
 from agents.play import record
 from agents.seeds import training_seed
 from agents.training.learning import learn
+from agents.training.plan import TrainingPlan, make_policies
 from agents.training.regression import Practice, regress
 from agents.training.run import POLICY, RULES_FILE, Run, keep_rules
 from agents.training.run_files import Row, check_plan, keep_plan, read_checkpoint
-from agents.training.settings import PlackettLuceSettings, TrainingPlan
+from agents.training.settings import PlackettLuceSettings
 from agents.training.swaps import raise_scores, try_swaps
 from dptse_env.sb3 import RoadPolicy, SB3VecEnv
 from dptse_env.traffic import Records
@@ -29,8 +30,8 @@ def train(plan: TrainingPlan, folder: Path, *, records: Records = None) -> list[
 
     The folder gets ``plan.json``, ``rules.json`` (errors of rules on validation traffic),
     ``checkpoint.pt``, ``progress.csv`` and ``curve.png`` (the learning curve),
-    ``best.safetensors`` and ``policy.safetensors`` (the policy best in validation, and the last),
-    and ``tensorboard`` where that is installed. What is there already is gone on with.
+    ``best.safetensors`` and ``policy.safetensors`` (the policy best in validation, and the last).
+    What is there already is gone on with.
 
     Args:
         plan: The plan.
@@ -59,7 +60,7 @@ def train_in_rounds(run: Run) -> None:
     plan, algorithm, kept = run.plan, run.plan.algorithm, run.checkpoint
     assert isinstance(algorithm, PlackettLuceSettings)
     torch.manual_seed(plan.seed)
-    policies = algorithm.make_policies(plan.worlds)
+    policies = make_policies(algorithm, plan.worlds)
     # Draws of the training must not depend on how many weights were drawn before them.
     torch.manual_seed(training_seed(plan.seed))
     if kept is not None:
@@ -96,7 +97,8 @@ def train_in_rounds(run: Run) -> None:
             try_swaps(policy, env, settings, index, plan.seed)
             for policy, env in zip(policies, environments, strict=True)
         ]
-        raise_scores(policies, tried, settings, settings.step_of(done))
+        step = settings.step + (settings.final_step - settings.step) * done
+        raise_scores(policies, tried, settings, step)
         error = sum(float(swaps.error.mean()) for swaps in tried) / len(tried)
         end(run.steps + seconds, {"error": error})
         lasted = run.done(run.steps) - done if plan.minutes is not None else 0.0

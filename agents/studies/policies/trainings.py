@@ -29,9 +29,10 @@ from agents.studies.policies import (
     validation_error,
 )
 from agents.study import Place, write_table
+from agents.training.plan import TrainingPlan
 from agents.training.run import BEST, CURVE, RULES_FILE
 from agents.training.run_files import PLAN, check_plan, keep_plan, read_progress
-from agents.training.settings import TrainingPlan, parse_algorithm
+from agents.training.settings import parse_algorithm
 from agents.training.training import require_trained, train
 from dptse_env.policies import read_policy
 from dptse_env.traffic import Records

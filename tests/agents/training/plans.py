@@ -5,8 +5,9 @@ import json
 import os
 import signal
 
+from agents.training.plan import TrainingPlan
 from agents.training.run_files import TrainingFolder
-from agents.training.settings import PlackettLuceSettings, TrainingPlan, parse_algorithm
+from agents.training.settings import PlackettLuceSettings, parse_algorithm
 from tests.helpers import SHORT
 
 ENV = f'{SHORT} {{"horizon": 80, "privacy": "capped"}}'

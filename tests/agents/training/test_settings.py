@@ -6,7 +6,8 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from agents.training.settings import ALGORITHMS, fitting, parse_algorithm
+from agents.training.plan import fitting
+from agents.training.settings import ALGORITHMS, parse_algorithm
 from dptse_env.config import resolve
 from tests.agents.training.plans import ENV, ONE, OTHER, make_algorithm, make_plan
 from tests.helpers import SHORT, SumRelease
@@ -26,7 +27,7 @@ def test_settings_that_are_given_replace_single_ones():
     given = parse_algorithm(
         'plackett-luce {"swaps": {"step": 9.0, "final_step": 1, "rounds": 5}}', 6
     )
-    assert [given.swaps.step_of(k) for k in (0.0, 0.25, 1.0)] == [9.0, 7.0, 1.0]
+    assert (given.swaps.step, given.swaps.final_step, given.swaps.trials) == (9.0, 1.0, 3)
     assert given.regression == parse_algorithm("plackett-luce", 6).regression
     road, mlp = parse_algorithm("ppo", 6), parse_algorithm('ppo {"policy": "mlp"}', 6)
     assert (road.policy, road.learning_rate, road.final_ent_coef) == ("road", 1e-3, 0.0)
