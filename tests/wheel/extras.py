@@ -26,7 +26,7 @@ WITH_TRAIN = {
         ["record", "--env", f"{SHORT[1]} {json.dumps({'corridor': LONGER})}", "--train-seeds", "0"],
     ],
     "ray": [
-        ["suite", "static", "--executor", "ray"],
+        ["evaluate", "--suite", "--policies", "static", "--executor", "ray"],
         ["evaluate", "--executor", "ray", "--test-seeds", "2000:2002", "--output", "ladder"],
     ],
 }
