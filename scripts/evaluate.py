@@ -146,6 +146,7 @@ def compare(args: Args) -> None:
     seeds = parse_seeds(args.test_seeds, "test_seeds")
     integer("seed", args.seed, 0)
     title += f", {len(seeds)} episode{'s' * (len(seeds) > 1)} on {seed_kind(seeds)} traffic"
+    title += f" from second {WARM_UP + 1} on"
     title += f", seed {args.seed}" if args.seed else ""
     title += f", actions {args.acts}" if args.acts else ""
     for cell in cells:
@@ -274,10 +275,8 @@ def legend(seeds: Sequence[int]) -> str:
     """Return what the numbers of the table are."""
     several = "Mean ± half of the 95 % interval"
     one = "One episode has no interval: differences may be chance"
-    return (
-        f"{several if len(seeds) > 1 else one}. The first {WARM_UP} s of an episode are left out. "
-        "chi2 is the squared error over its reported variance, 1 of an honest estimator"
-    )
+    chi2 = "chi2 is the squared error over its reported variance, 1 of an honest estimator"
+    return f"{several if len(seeds) > 1 else one}. {chi2}"
 
 
 def verdicts(rows: pl.DataFrame, scores: Sequence[Score], cells: Sequence[Cell]) -> list[str]:

@@ -163,7 +163,7 @@ def test_policies_and_schedules_play_what_gym_make_makes(tmp_path):
         "999:1001", "--seed", "5", "--output", tmp_path / "out", "--workers", "1",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "2 episodes on mixed traffic, seed 5\n" in done.stdout
+    assert "2 episodes on mixed traffic from second 61 on, seed 5\n" in done.stdout
     for name, action in (("oldest-first", "mask"), ("run/best", "slots")):
         assert name in done.stdout
         env = gym.make(SHORT, traffic_seeds="999:1001", action=action)
