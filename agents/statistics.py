@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,24 +106,27 @@ def bootstrap(
         seed: Seeds the resampling.
 
     Raises:
-        ValueError: Tables do not pair up, are too small or not finite, or the statistic is not.
+        ValueError: Tables do not pair up or are too small, or the statistic is not finite.
     """
-    checked = _paired_tables(tables)
-    if n_resamples < 100:
-        raise ValueError(f"n_resamples must be >= 100, got {n_resamples}")
-    n_columns = checked[0].shape[1]
+    arrays = [np.atleast_2d(np.asarray(table, dtype=np.float64)) for table in tables]
+    shapes = [array.shape for array in arrays]
+    n_columns = shapes[0][-1]
+    if n_columns < 2 or any(each[0] < 1 or each[1:] != (n_columns,) for each in shapes):
+        raise ValueError(
+            f"tables must have training seeds and 2 or more common traffic seeds, got {shapes}"
+        )
     generator = np.random.default_rng(seed)
     parts = []
     for first in range(0, n_resamples, _CHUNK):
         size = min(_CHUNK, n_resamples - first)
         columns = generator.integers(n_columns, size=(size, 1, n_columns))
         drawn = []
-        for table in checked:
+        for table in arrays:
             rows = generator.integers(len(table), size=(size, len(table), 1))
             drawn.append(table[rows, columns])
         parts.append(statistic(*drawn))
     values = np.concatenate(parts)
-    estimate = float(statistic(*(table[None] for table in checked))[0])
+    estimate = float(statistic(*(table[None] for table in arrays))[0])
     if not (np.isfinite(values).all() and np.isfinite(estimate)):
         raise ValueError("the statistic must be finite on every resample")
     low, high = np.percentile(values, [2.5, 97.5])
@@ -132,23 +135,3 @@ def bootstrap(
 
 _CHUNK = 500
 """Resamples drawn at once, which bounds the memory."""
-
-
-def _paired_tables(tables: Sequence[ArrayLike]) -> list[FloatArray]:
-    """Return tables as arrays (S, T), checked."""
-    checked = []
-    for table in tables:
-        array = np.asarray(table, dtype=np.float64)
-        array = array[None] if array.ndim == 1 else array
-        if array.ndim != 2 or len(array) < 1 or array.shape[1] < 2:
-            raise ValueError(
-                f"a table needs a training seed and 2 traffic seeds, got shape {array.shape}"
-            )
-        if not np.isfinite(array).all():
-            raise ValueError(f"values must be finite, {np.sum(~np.isfinite(array))} are not")
-        checked.append(array)
-    if len({array.shape[1] for array in checked}) != 1:
-        raise ValueError(
-            f"tables must have the same traffic seeds, got {[a.shape for a in checked]}"
-        )
-    return checked

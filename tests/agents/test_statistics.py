@@ -28,15 +28,11 @@ def test_the_interval_is_students_and_covers_as_often_as_it_says():
 REFUSED = [
     (mean_interval, ([1.0],), "at least 2 values"),
     (mean_interval, ([1.0, float("nan")],), "finite"),
-    (bootstrap, (interquartile_mean, np.ones((5, 1))), r"2 traffic seeds, got shape \(5, 1\)"),
-    (bootstrap, (interquartile_mean, np.ones((0, 4))), "a training seed"),
-    (bootstrap, (interquartile_mean, np.ones((2, 3, 4))), r"got shape \(2, 3, 4\)"),
-    (
-        bootstrap,
-        (interquartile_mean, np.array([[1.0, np.nan]])),
-        "values must be finite, 1 are not",
-    ),
-    (bootstrap, (percent_below, np.ones((2, 4)), np.ones(5)), "same traffic seeds"),
+    (bootstrap, (interquartile_mean, np.ones((5, 1))), r"2 or more .*, got \[\(5, 1\)\]"),
+    (bootstrap, (interquartile_mean, np.ones((0, 4))), r"got \[\(0, 4\)\]"),
+    (bootstrap, (interquartile_mean, np.ones((2, 3, 4))), r"got \[\(2, 3, 4\)\]"),
+    (bootstrap, (interquartile_mean, np.array([[1.0, np.nan]])), "every resample"),
+    (bootstrap, (percent_below, np.ones((2, 4)), np.ones(5)), r"got \[\(2, 4\), \(1, 5\)\]"),
     (bootstrap, (percent_below, np.ones(3), np.array([-1.0, 0.0, 1.0])), "every resample"),
 ]
 
@@ -45,8 +41,6 @@ def test_what_has_no_statistic_is_refused():
     for function, given, message in REFUSED:
         with pytest.raises(ValueError, match=message), np.errstate(divide="ignore"):
             function(*given)
-    with pytest.raises(ValueError, match="n_resamples must be >= 100, got 9"):
-        bootstrap(interquartile_mean, np.ones(3), n_resamples=9)
 
 
 def coverage(make_interval, spreads, n_trials=300, n_runs=5, n_traffic=64):
