@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import torch
@@ -134,8 +135,8 @@ def train_all(
     the training goes on from its last checkpoint.
 
     Args:
-        plans: Plans by folder, which differ in their seeds alone. Folders are made where they are
-            missing; nodes of a cluster have to share them.
+        plans: Plans by folder. Folders are made where they are missing; nodes of a cluster have to
+            share them.
         executor: Runs the trainings.
         records: Library of records, or its folder; None for the user's cache.
         threads: Threads of torch in each training; numbers depend on it in the last digits.
@@ -150,10 +151,12 @@ def train_all(
         check_plan(folder, plan.content())
     for folder, plan in plans.items():
         keep_plan(folder, plan.content())
-    first = next(iter(plans))
-    rules = keep_rules(plans[first], first, records)
-    for folder in plans:
-        write_json(folder / RULES_FILE, rules)
+    rules: dict[Any, dict[str, float]] = {}
+    for folder, plan in plans.items():
+        traffic = plan.envs, plan.validation_seeds
+        if traffic not in rules:
+            rules[traffic] = keep_rules(plan, folder, records)
+        write_json(folder / RULES_FILE, rules[traffic])
     work = partial(_train_there, records=records, threads=threads)
     tasks = [(plan, folder.absolute()) for folder, plan in plans.items()]
 

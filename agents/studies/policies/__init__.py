@@ -529,7 +529,7 @@ def study(minutes: float | None = None, seeds: str = "0:5") -> Study:
     def follow(rows: pl.DataFrame, place: Place) -> list[Cell]:
         from agents.studies.policies.trainings import train_ladder  # noqa: PLC0415 (needs torch)
 
-        train_ladder(rows, place, time, training_seeds)
+        train_ladder(place, time, training_seeds)
         return test_cells(rows, place)
 
     return dataclasses.replace(STUDY, follow=follow)

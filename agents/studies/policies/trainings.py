@@ -3,39 +3,32 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from functools import partial
-from itertools import chain
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import polars as pl
-import torch
 
 from agents.environments import make_config, quietly
-from agents.executors import run_shown
-from agents.files import write_json
 from agents.play import record
 from agents.studies.policies import (
     CURVES,
     LEARNERS,
     PLACKETT_LUCE,
-    RULES,
     SETTINGS,
     STARTED,
     ranked_learners,
     read_curves,
     training_folder,
-    validation_error,
 )
 from agents.study import Place, write_table
 from agents.training.plan import TrainingPlan
-from agents.training.run import BEST, CURVE, RULES_FILE
-from agents.training.run_files import PLAN, check_plan, keep_plan, read_progress
+from agents.training.run import BEST, CURVE
+from agents.training.run_files import check_plan, read_progress
 from agents.training.settings import parse_algorithm
-from agents.training.training import require_trained, train
+from agents.training.training import train_all
+from dptse_env.config import EnvConfig
 from dptse_env.policies import read_policy
-from dptse_env.traffic import Records
 
 BEST_LEARNERS = 2
 """Learners of each setting that are trained with every training seed."""
@@ -56,27 +49,17 @@ class Training(NamedTuple):
         """The training that it starts from, if it is one of `STARTED`."""
         return self._replace(learner=START)
 
-    @property
-    def stages(self) -> tuple[Training, ...]:
-        """It, after what it starts from."""
-        return (self.start, self) if self.learner == STARTED else (self,)
-
-    def is_finished(self, study: Path) -> bool:
-        """Return whether it has come to its end, where it draws its curve."""
-        return (self.folder(study) / CURVE).exists()
-
     def folder(self, study: Path) -> Path:
         """Return its folder in that of the study."""
         return training_folder(study, *self)
 
 
-def train_ladder(rows: pl.DataFrame, place: Place, minutes: float, seeds: Sequence[int]) -> None:
+def train_ladder(place: Place, minutes: float, seeds: Sequence[int]) -> None:
     """Train what is missing, and keep the learning curves in the folder of the study.
 
     Every learner is trained with the first seed, the best of each setting with the others, too.
 
     Args:
-        rows: Rows of the rules on validation traffic.
         place: Folder of the study, and what runs the trainings, side by side.
         minutes: Time of each training.
         seeds: Training seeds.
@@ -86,21 +69,16 @@ def train_ladder(rows: pl.DataFrame, place: Place, minutes: float, seeds: Sequen
         OSError: A folder cannot be written.
         ExecutorError: Workers died again and again, or write to other disks than this machine's.
     """
-    rules = {
-        name: {rule: validation_error(rows, name, rule) / 1000.0 for rule in RULES}
-        for name in SETTINGS
-    }
-    for setting in SETTINGS.values():
-        with quietly():
-            corridor = make_config(setting.env, setting.keywords).corridor
-        record(corridor, setting.traffic.training, place.records, progress=True)
+    for name, setting in SETTINGS.items():
+        corridor, seeds_to_train = config_of(name).corridor, setting.traffic.training
+        record(corridor, seeds_to_train, place.records, progress=True)
     first = [
         Training(name, learner, seeds[0])
         for name in SETTINGS
         for learner in LEARNERS
         if fits(name, learner)
     ]
-    _train_missing(first, place, minutes, rules)
+    _train_missing(first, place, minutes)
     curves = read_curves(place.folder)
     further = [
         Training(name, learner, seed)
@@ -108,14 +86,18 @@ def train_ladder(rows: pl.DataFrame, place: Place, minutes: float, seeds: Sequen
         for learner in ranked_learners(curves, name, seeds[0])[:BEST_LEARNERS]
         for seed in seeds[1:]
     ]
-    _train_missing(further, place, minutes, rules)
+    _train_missing(further, place, minutes)
+
+
+def config_of(setting: str) -> EnvConfig:
+    """Return the configuration of a setting."""
+    with quietly():
+        return make_config(SETTINGS[setting].env, SETTINGS[setting].keywords)
 
 
 def fits(setting: str, learner: str) -> bool:
     """Return whether a learner can choose the queries of a setting."""
-    env, keywords = SETTINGS[setting].env, SETTINGS[setting].keywords
-    with quietly():
-        config = make_config(env, keywords)
+    config = config_of(setting)
     return parse_algorithm(LEARNERS[learner][0], config.corridor.geometry.n_mainline).fits(config)
 
 
@@ -131,8 +113,7 @@ def plan_of(training: Training, study: Path, minutes: float) -> TrainingPlan:
     name, own = LEARNERS[PLACKETT_LUCE if learner == START else learner]
     if learner in (START, STARTED):
         minutes /= 2
-    with quietly():
-        n_segments = make_config(setting.env, setting.keywords).corridor.geometry.n_mainline
+    n_segments = config_of(training.setting).corridor.geometry.n_mainline
     given = {**setting.changes.get(name, {}), **own}
     algorithm = parse_algorithm(f"{name} {json.dumps(given)}", n_segments)
     return TrainingPlan(
@@ -146,38 +127,16 @@ def plan_of(training: Training, study: Path, minutes: float) -> TrainingPlan:
     )
 
 
-def _train_missing(
-    trainings: Sequence[Training], place: Place, minutes: float, rules: Mapping[str, Any]
-) -> None:
+def _train_missing(trainings: Sequence[Training], place: Place, minutes: float) -> None:
     study = place.folder.absolute()
-    for each in chain.from_iterable(training.stages for training in trainings):
-        if (each.folder(study) / PLAN).exists():
-            check_plan(each.folder(study), plan_of(each, study, minutes).content())
-    missing = [(each, rules[each.setting]) for each in trainings if not each.is_finished(study)]
-
-    def take(index: int, _: None) -> None:
-        require_trained(missing[index][0].folder(study), CURVE)
-        keep_curves(study)
-
-    work = partial(_train_there, study=study, minutes=minutes, records=place.records)
-    run_shown(place.executor, work, missing, take, desc="training", unit="training")
+    for stage in ([each.start for each in trainings if each.learner == STARTED], trainings):
+        plans = {each.folder(study): plan_of(each, study, minutes) for each in stage}
+        for folder, plan in plans.items():
+            check_plan(folder, plan.content())
+        # A training that has come to its end has drawn its curve.
+        missing = {folder: plan for folder, plan in plans.items() if not (folder / CURVE).exists()}
+        train_all(missing, place.executor, records=place.records)
     keep_curves(study)
-
-
-def _train_there(
-    task: tuple[Training, dict[str, float]], study: Path, minutes: float, records: Records
-) -> None:
-    """Train, after what the training starts from; rules have their errors on validation traffic."""
-    training, rules = task
-    torch.set_num_threads(1)
-    for each in training.stages:
-        if not each.is_finished(study):
-            folder, plan = each.folder(study), plan_of(each, study, minutes)
-            keep_plan(folder, plan.content())
-            write_json(folder / RULES_FILE, rules)
-            corridor = plan.worlds[0].config.corridor
-            record(corridor, (*plan.traffic_seeds, *plan.validation_seeds), records)
-            train(plan, folder, records=records)
 
 
 def keep_curves(study: Path) -> None:
@@ -191,7 +150,8 @@ def keep_curves(study: Path) -> None:
         training = Training(setting, learner, int(seed))
         if learner not in LEARNERS:
             continue
-        earlier = [read_progress(each.folder(study))[-1] for each in training.stages[:-1]]
+        starts = [training.start] if learner == STARTED else []
+        earlier = [read_progress(each.folder(study))[-1] for each in starts]
         parts += [
             {
                 "setting": setting,

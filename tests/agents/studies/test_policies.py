@@ -12,7 +12,7 @@ from agents.statistics import bootstrap, percent_below, percent_of_way
 from agents.studies import policies
 from agents.studies.policies import GAIN, ORACLE, ROUND_ROBIN, RULES, STARTED, TEST, VALIDATION
 from agents.studies.policies.trainings import START, Training, fits, plan_of, train_ladder
-from agents.study import Place, play_study, read_rows, read_table, run, write_report, write_table
+from agents.study import Place, read_rows, read_table, run, write_report, write_table
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.policies import read_policy, shipped_policies
 from tests.agents.training.plans import SMALL
@@ -222,13 +222,12 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     for module in (policies, policies.trainings):
         monkeypatch.setattr(module, "LEARNERS", learners)
         monkeypatch.setattr(module, "SETTINGS", {"short": setting})
-        monkeypatch.setattr(module, "RULES", (ROUND_ROBIN, OTHER))
+    monkeypatch.setattr(policies, "RULES", (ROUND_ROBIN, OTHER))
     monkeypatch.setattr(policies, "SHIPPED", {})
     cells = tuple(policies._cell("short", rule, VALIDATION) for rule in (ROUND_ROBIN, OTHER))
     monkeypatch.setattr(policies, "STUDY", replace(policies.STUDY, cells=cells))
     place = Place(tmp_path, this_process)
-    validated = play_study(policies.STUDY, place)
-    train_ladder(validated, place, 0.05, (0,))
+    train_ladder(place, 0.05, (0,))
     curves = read_table(tmp_path / policies.CURVES)
     assert set(curves["policy"]) == set(learners)
     kept = tmp_path / "trainings" / "short" / "qr-dqn" / "0" / "checkpoint.pt"
@@ -245,5 +244,5 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     assert rows["cell"].n_unique() == 2 + 2 + 6
     assert rows.filter(policy=GAIN)["traffic_seed"].n_unique() == 2
     assert "| plackett-luce |" in (tmp_path / "tables.md").read_text("utf-8")
-    with pytest.raises(ValueError, match=r"another plan: minutes is 0\.05 there and 0\.1 now"):
-        train_ladder(validated, place, 0.1, (0,))
+    with pytest.raises(ValueError, match=r"another plan: minutes is 0\.025 there and 0\.05 now"):
+        train_ladder(place, 0.1, (0,))

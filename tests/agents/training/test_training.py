@@ -21,6 +21,7 @@ from agents.environments import make_vector
 from agents.executors import ExecutorError, this_process
 from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
+from agents.training import training
 from agents.training.plan import make_policies
 from agents.training.run import BEST, CURVE, POLICY, RULES, RULES_FILE, Run
 from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_checkpoint, read_progress
@@ -32,6 +33,7 @@ from dptse_env.utils.files import read_tensors
 from tests.agents.elsewhere import elsewhere
 from tests.agents.training.plans import (
     ENV,
+    ONE,
     SMALL,
     STEPS,
     WIDE,
@@ -370,11 +372,26 @@ def test_a_folder_of_another_plan_is_refused_before_anything_runs(whole, tmp_pat
     assert not (tmp_path / "9").exists()
 
 
-def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
-    def apart(work, tasks):
-        """Train on the disk of another machine."""
-        yield 0, None
+def apart(work, tasks):
+    """Train on the disk of another machine."""
+    yield 0, None
 
+
+def test_rules_are_played_once_for_each_environment(tmp_path, monkeypatch):
+    def keep(plan, folder, records):
+        played.append(plan.envs)
+        return {"static": float(len(played))}
+
+    played = []
+    monkeypatch.setattr(training, "keep_rules", keep)
+    plans = [make_plan(), make_plan(envs=(ONE,)), make_plan(seed=2)]
+    with pytest.raises(ExecutorError):
+        train_all({tmp_path / str(k): plan for k, plan in enumerate(plans)}, apart)
+    errors = [json.loads((tmp_path / str(k) / RULES_FILE).read_text())["static"] for k in range(3)]
+    assert (errors, played) == ([1.0, 2.0, 1.0], [plans[0].envs, (ONE,)])
+
+
+def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
     with pytest.raises(ExecutorError, match="choose an --output that all nodes have"):
         train_all({tmp_path / "0": make_plan()}, apart)
 
