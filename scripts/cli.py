@@ -319,12 +319,17 @@ def _unboxed(box: str) -> str:
     """Return what a box says of an error, in one line, without the help on options in it."""
     lines = [line.strip("│").removeprefix(" ").rstrip() for line in box.splitlines()]
     said = []
-    for is_rule, section in groupby(lines, key=lambda line: line[:1] in ("╭", "─", "╰")):
+    for is_rule, section in groupby(lines, key=_is_rule):
         first = takewhile(bool, section)  # what follows a blank line are details
         words = " ".join(line.strip() for line in first if not line.startswith(" " * 8))
         if not is_rule and not words.startswith(("For full", "Argument helptext")):
             said.append(words.rstrip("."))
-    return "; ".join(said)
+    # Where stdout is not in UTF-8 the title is above a rule, not in it.
+    return "; ".join(said if box.startswith("╭") else said[1:])
+
+
+def _is_rule(line: str) -> bool:
+    return line[:1] in ("╭", "─", "╰") or set(line.strip()) == {"-"}
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """All commands: their help and its examples, the status of a run, and bad input in one line."""
 
+import contextlib
 import errno
 import io
 import json
@@ -21,7 +22,7 @@ from dptse_env import command_line
 from dptse_env.traffic import RecordingError
 from dptse_env.utils.registry import EXTRAS
 from dptse_env.versions import code_version
-from scripts import info
+from scripts import dptse, info
 from scripts.dptse import GONE, MODULES, RENAMED
 from tests.helpers import ROOT, SHORT, fast_and_slow, save_untrained
 from tests.importers.data import plain, stream
@@ -142,6 +143,14 @@ def test_what_has_the_place_of_an_option_is_told(name, old, monkeypatch):
 )
 def test_a_line_that_cannot_be_parsed_is_an_error_in_one_line(words, said):
     assert said in refused(*words)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_the_line_is_the_same_where_stdout_lacks_letters(encoding, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+    with contextlib.redirect_stderr(io.StringIO()) as err, pytest.raises(SystemExit):
+        dptse.main(["record", "--workers"])
+    assert err.getvalue() == "error: Missing value for argument '--workers'. Expected 1 values\n"
 
 
 def test_every_command_can_be_quiet_and_can_print_json(monkeypatch):
