@@ -18,6 +18,8 @@ def test_a_policy_gets_a_card_and_its_scores_beside_another_card(tmp_path):
     assert done.returncode == 0, done.stderr
     card = json.loads((tmp_path / "mine" / "card.json").read_text())
     assert card["scores"].keys() == SMALL.keys()
+    again = run_command("evaluate", "--suite", "--policies", "random", *words, "--json")
+    assert json.loads(again.stdout) == card
     words = "--beside", tmp_path / "mine/card.json", "--output", tmp_path / "other"
     done = run_command("evaluate", "--suite", "--policies", "static", *words, "--workers", "1")
     (line,) = (line for line in done.stdout.splitlines() if line.strip().startswith("mean"))
