@@ -17,8 +17,8 @@ import contextlib
 import json
 import shutil
 import threading
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from typing import Any
 import torch
 
 from agents.environments import make_config, parse_env, quietly
-from agents.executors import Executor, run_shown, this_process
+from agents.executors import Executor, run_in_order, this_process
 from agents.filters.highways import draw_highway
 from agents.filters.plan import FilterPlan, Round, played_by
 from agents.filters.scenarios import Kind, ScenarioRanges
@@ -122,45 +122,40 @@ def main(args: Args) -> None:
     """Record missing traffic, train, and print the keywords that take the weights."""
     seeds = parse_seeds(args.seed, "seed")
     require(bool(args.kinds), "kinds", "one or more", args.kinds)
+    plans = {kind: make_plan(args, kind, seeds[0]) for kind in args.kinds}
     tasks = [
-        (make_plan(args, kind, seed), args.output / f"{kind}-{seed}")
-        for kind in dict.fromkeys(args.kinds)
+        (replace(plan, seed=seed), args.output / f"{kind}-{seed}")
+        for kind, plan in plans.items()
         for seed in seeds
     ]
-    plans = list({plan.kind: plan for plan, _ in tasks}.values())
-    for plan in plans:
+    for plan in plans.values():
         plan.check()
     for plan, folder in tasks:
         check_plan(folder, plan.settings())
     own = [f"{folder.name}/{PLAN}" for _, folder in tasks]
-    require_output(args.output, [f"{NAME}-{kind}.safetensors" for kind in args.kinds], own=own)
+    require_output(args.output, [f"{NAME}-{kind}.safetensors" for kind in plans], own=own)
     executor = args.start_executor()
-    record_all(args, plans, executor)
-    last: dict[Path, Row] = {}
+    record_all(args, plans.values(), executor)
     with followed(tasks):
         if len(tasks) == 1:  # the workers then play its scenarios
-            last[tasks[0][1]] = train(tasks[0], args.records, executor)
+            last = [train(tasks[0], args.records, executor)]
         else:
             work = partial(train, records=args.records)
-
-            def take(index: int, row: Row) -> None:
-                last[tasks[index][1]] = row
-
-            run_shown(executor, work, tasks, take, progress=False)
-    table = make_table("on validation traffic", "training", "error x 1000", "on sections", "chi2")
+            last = run_in_order(executor, work, tasks, progress=False)
     columns = ("validation", "sections", "chi2")
     trainings = {
         folder.name: {name: row[name] for name in columns if name in row}
-        for folder, row in sorted(last.items())
+        for (_, folder), row in zip(tasks, last, strict=True)
     }
+    table = make_table("on validation traffic", "training", "error x 1000", "on sections", "chi2")
     for training, row in trainings.items():
         errors = [f"{1000 * row[name]:.1f}" if name in row else "" for name in columns[:2]]
         table.add_row(training, *errors, f"{row['chi2']:.2f}")
-    for kind in dict.fromkeys(plan.kind for plan, _ in tasks):
-        folders = [folder for plan, folder in tasks if plan.kind == kind]
-        best = min(folders, key=lambda folder: last[folder]["validation"])
+    for kind in plans:
+        names = [f"{kind}-{seed}" for seed in seeds]
+        best = min(names, key=lambda name: trainings[name]["validation"])
         with replacing(args.output / f"{NAME}-{kind}.safetensors") as temporary:
-            shutil.copyfile(best / WEIGHTS, temporary)
+            shutil.copyfile(args.output / best / WEIGHTS, temporary)
     keywords = played_by(args.output / NAME)
     args.answer(
         {"trainings": trainings, "keywords": keywords},
@@ -177,29 +172,19 @@ def train(task: Task, records: Path | None, executor: Executor = this_process) -
     return training.rows[-1]
 
 
-def record_all(args: Args, plans: Sequence[FilterPlan], executor: Executor) -> None:
+def record_all(args: Args, plans: Iterable[FilterPlan], executor: Executor) -> None:
     """Record the traffic of the environments and highways of plans that is missing."""
-    wanted = dict.fromkeys(
-        (env, seeds)
-        for plan in plans
-        for envs, seeds in (
-            (plan.ranges.envs, plan.traffic_seeds),
-            (plan.validation_envs, plan.validation_seeds),
-        )
-        for env in envs
-    )
-    for env, seeds in wanted:
-        with quietly():
-            corridor = make_config(*parse_env(env)).corridor
-        args.library(corridor, seeds)
-    numbers = dict.fromkeys(
-        number
-        for plan in plans
-        for span in (plan.ranges.highways, plan.validation_highways)
-        for number in range(*span)
-    )
+    numbers: set[int] = set()
+    for plan in plans:
+        numbers.update(range(*plan.ranges.highways), range(*plan.validation_highways))
+        trained = plan.ranges.envs, plan.traffic_seeds
+        for envs, seeds in (trained, (plan.validation_envs, plan.validation_seeds)):
+            for env in envs:
+                with quietly():
+                    corridor = make_config(*parse_env(env)).corridor
+                args.library(corridor, seeds)
     work = partial(record_highway, records=args.records)
-    run_shown(executor, work, list(numbers), lambda *done: None, desc="highways", unit="record")
+    run_in_order(executor, work, sorted(numbers), desc="highways", unit="record")
 
 
 def record_highway(number: int, records: Path | None) -> None:

@@ -97,14 +97,14 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) 
 
 def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
     process = env.process
-    recorder, watcher = _Recorder(process), _Watcher(process)
+    recorder = _Recorder(process)
     process.estimator = recorder  # type: ignore[assignment]
     evaluate(
         env,
         scenario.schedule,
         scenario.traffic_seeds,
         scenario.noise_seed,
-        watchers=[lambda _: watcher],
+        watchers=[lambda _: recorder],
     )
     env.close()
     measured = [np.stack(arrays) for arrays in zip(*recorder.measured, strict=True)]
@@ -114,23 +114,25 @@ def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
         is_section=scenario.section is not None,
         channels=process.model.channels,
         cells=make_cells(process.model),
-        start=watcher.start,
+        start=recorder.start,
         observed=observed,
         values=_single(values),
         sigma=_single(sigma),
         centre=_single(centre),
         inputs=_single(np.stack(recorder.inputs)),
-        truth=np.stack(watcher.truth),
+        truth=np.stack(recorder.truth),
     )
 
 
 class _Recorder:
-    """An estimator that records its inputs."""
+    """An estimator that records its inputs, and a watcher that records the prior and the truth."""
 
     def __init__(self, process: QueryProcess) -> None:
         self._estimator, self._process = process.estimator, process
         self.measured: list[tuple[AnyArray, ...]] = []
         self.inputs: list[FloatArray] = []
+        self.start: AnyArray = np.empty(0)
+        self.truth: list[AnyArray] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._estimator, name)
@@ -147,16 +149,8 @@ class _Recorder:
         self.measured.append(tuple(array.copy() for array in own))
         self._estimator.update(episodes, measured)
 
-
-class _Watcher:
-    """Records the prior and the truth of every second; adds nothing to the results."""
-
-    def __init__(self, process: QueryProcess) -> None:
-        self._process = process
-        self.start: AnyArray = np.empty(0)
-        self.truth: list[AnyArray] = []
-
     def __call__(self) -> None:
+        """Record the prior at the reset, and the truth of every second."""
         process = self._process
         if self.start.size == 0:
             said = process.estimate
@@ -166,6 +160,7 @@ class _Watcher:
             self.truth.append(_single(process.truth(np.arange(process.n_episodes))))
 
     def rows(self) -> list[Row]:
+        """Add nothing to the results."""
         return [{}] * self._process.n_episodes
 
 
@@ -233,33 +228,32 @@ class Batch:
 
 def _roads(parts: Sequence[Episodes]) -> Roads:
     """Return the cells of all episodes."""
-    unit, limit, edges, scales, mainline, episode, ordinary = ([] for _ in range(7))
+    columns: list[tuple[AnyArray, ...]] = []
     first = n_episodes = 0
     for part in parts:
         cells, corridor, k = part.cells, part.corridor, len(part.start)
         S = corridor.road.n_segments
-        unit.append(np.tile(cells.unit[:S], k))
-        limit.append(np.full(k * S, cells.limit))
+        units = [corridor.scales.density_scale, corridor.scales.speed_scale]
         offsets = first + S * np.arange(k)[:, None, None]
-        edges.append((corridor.road.edges + offsets).reshape(-1, 2))
-        scales.append(
-            np.tile([corridor.scales.density_scale, corridor.scales.speed_scale], (k * S, 1))
-        )
-        mainline.append(np.tile(np.arange(S) < corridor.geometry.n_mainline, k))
-        episode.append(n_episodes + np.repeat(np.arange(k), S))
-        ordinary.append(np.full(k, not part.is_section))
+        columns.append((
+            np.tile(cells.unit[:S], k),
+            np.full(k * S, cells.limit),
+            (corridor.road.edges + offsets).reshape(-1, 2),
+            np.tile(units, (k * S, 1)),
+            np.tile(np.arange(S) < corridor.geometry.n_mainline, k),
+            n_episodes + np.repeat(np.arange(k), S),
+            np.full(k, not part.is_section),
+        ))  # fmt: skip
         first, n_episodes = first + k * S, n_episodes + k
-
-    def joined(arrays: list[AnyArray], dtype: torch.dtype) -> Tensor:
-        return torch.from_numpy(np.concatenate(arrays)).to(dtype)
-
+    arrays = [np.concatenate(column) for column in zip(*columns, strict=True)]
+    unit, limit, edges, scales, mainline, episode, ordinary = map(torch.from_numpy, arrays)
     return Roads(
-        unit=joined(unit, torch.float32),
-        limit=joined(limit, torch.float32),
-        edges=joined(edges, torch.int64),
-        scales=joined(scales, torch.float32),
-        mainline=joined(mainline, torch.float32),
-        episode=joined(episode, torch.int64),
-        ordinary=joined(ordinary, torch.float32),
+        unit=unit.float(),
+        limit=limit.float(),
+        edges=edges.long(),
+        scales=scales.float(),
+        mainline=mainline.float(),
+        episode=episode.long(),
+        ordinary=ordinary.float(),
         n_episodes=n_episodes,
     )
