@@ -8,13 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-from agents.environments import quietly, unwrap
 from agents.figures import COLOURS
-from agents.play import Cell
-from dptse_env.evaluation import Row, evaluate
+from agents.play import Cell, play
+from dptse_env.evaluation import Row
 from dptse_env.privacy import rounded_up
 from dptse_env.process import QueryProcess
 from dptse_env.rendering import DENSITY_MAP, History
@@ -64,19 +62,14 @@ class Watched:
 
 def watch(name: str, cell: Cell, seed: int, records: Records = None) -> Watched:
     """Play a cell on one traffic seed, and keep what happens."""
-    more = {"traffic_seeds": [seed], "records": records}
-    with quietly():
-        env = gym.make(cell.env, disable_env_checker=True, **{**cell.all_keywords, **more})
-    watched = Watched(name, unwrap(env).process)
-    (watched.row,) = evaluate(
-        env,
-        cell.load_policy(env),
-        [seed],
-        cell.noise_seed,
-        deterministic=cell.deterministic,
-        watchers=[lambda process: watched],
-    )
-    return watched
+    watched: list[Watched] = []
+
+    def begin(process: QueryProcess) -> Watched:
+        watched.append(Watched(name, process))
+        return watched[0]
+
+    (watched[0].row,) = play(cell, [seed], records, watchers=[begin])
+    return watched[0]
 
 
 def write_page(

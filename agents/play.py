@@ -16,7 +16,7 @@ from agents.policies import find_policy
 from agents.watchers import WATCHERS
 from dptse_env.config import EnvConfig
 from dptse_env.estimators.recurrent import member_for, read_weights, shipped_weights
-from dptse_env.evaluation import WARM_UP, Row, evaluate
+from dptse_env.evaluation import WARM_UP, Row, WatcherFactory, evaluate
 from dptse_env.policies import TRANSFERABLE
 from dptse_env.traffic import Corridor, RecordLibrary, Records, open_library
 from dptse_env.utils.files import file_digest
@@ -156,7 +156,11 @@ def _with_digests(value: Any) -> Any:
 
 
 def play(
-    cell: Cell, seeds: Sequence[int], records: Records = None, threads: int | None = 1
+    cell: Cell,
+    seeds: Sequence[int],
+    records: Records = None,
+    threads: int | None = 1,
+    watchers: Sequence[WatcherFactory] = (),
 ) -> list[Row]:
     """Play a cell on some traffic seeds, all at once, and return a row for each.
 
@@ -167,6 +171,7 @@ def play(
         seeds: Traffic seeds.
         records: Folder of the record cache or a library; None for the user's cache.
         threads: Threads of the estimator; None for one per core.
+        watchers: Those that watch beside the cell's.
 
     Raises:
         FileNotFoundError: There is no such policy.
@@ -190,7 +195,7 @@ def play(
             seeds,
             cell.noise_seed,
             deterministic=cell.deterministic,
-            watchers=[WATCHERS[name] for name in cell.watchers],
+            watchers=[*(WATCHERS[name] for name in cell.watchers), *watchers],
         )
     except Exception as problem:
         raise PlayError(_blame(cell, problem)) from problem
