@@ -119,7 +119,8 @@ def _in_processes(
             timeout=IDLE,
             initializer=_begin,
             initargs=(os.getpid(), compiling_is_said.is_set()),
-            env={"OMP_NUM_THREADS": "1"},
+            # Those of another folder would not find what is named from here.
+            env={"OMP_NUM_THREADS": "1", "PWD": os.getcwd()},
         )
         try:
             while left:

@@ -103,6 +103,13 @@ def test_processes_have_one_thread_and_do_not_repeat_what_this_one_has_said(monk
     assert run_in_order(executor, os.getenv, ["OMP_NUM_THREADS"]) == ["1"]
 
 
+def test_tasks_run_in_the_folder_of_this_process(tmp_path, monkeypatch):
+    executor = make_executor("local", 2)
+    for folder in (tmp_path, tmp_path.parent):
+        monkeypatch.chdir(folder)
+        assert run_in_order(executor, os.path.realpath, ["a"]) == [os.path.realpath("a")]
+
+
 def test_a_task_whose_worker_died_runs_again_three_times(monkeypatch):
     """With processes in this one, which die as often as they should."""
 
