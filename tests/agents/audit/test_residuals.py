@@ -152,6 +152,7 @@ def test_the_page_says_which_attack_finds_a_broken_mechanism(name):
     setting = make_config(SHORT, {"epsilon": 5.0, "privacy": {"preset": MECHANISMS[name]}})
     record = RecordLibrary().get(setting.corridor, 0)
     one, two = audit_one_run(setting, record), audit_environment(setting, record, trials=500)
-    found = one.noise.is_rejected, *(each.result.verdict == "rejected" for each in (two, one))
+    verdicts = [each.attack.result.verdict for each in (two, one)]
+    found = one.noise.is_rejected, *(each == "rejected" for each in verdicts)
     cells = " | ".join("rejected" if each else "–" for each in found)
     assert f"| {name} | {cells} |" in PAGE
