@@ -18,6 +18,7 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from functools import partial
 from itertools import islice
+from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
 import loky
@@ -120,7 +121,7 @@ def _in_processes(
             initializer=_begin,
             initargs=(os.getpid(), compiling_is_said.is_set()),
             # Those of another folder would not find what is named from here.
-            env={"OMP_NUM_THREADS": "1", "PWD": os.getcwd()},
+            env={"OMP_NUM_THREADS": "1", "PWD": str(Path.cwd())},
         )
         try:
             while left:
