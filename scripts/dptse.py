@@ -36,7 +36,7 @@ GONE = {
     "suite": "evaluate --suite",
     "tune": "fit --tune",
     "policy": "import policy",
-    "replay-field": "import field, and then evaluate",
+    "replay-field": "import field and dptse evaluate",
 }
 """What has the place of commands that there were."""
 
