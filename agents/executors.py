@@ -19,7 +19,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, TypeVar
 
 import loky
 
@@ -33,6 +33,10 @@ from dptse_env.utils.validation import integer
 TaskT = TypeVar("TaskT")
 ResultT = TypeVar("ResultT")
 Results = Generator[tuple[int, ResultT], None, None]
+
+Executor = Callable[[Callable[[Any], Any], Sequence[Any]], Results[Any]]
+"""Runs work, a function that workers can import, on tasks that can be pickled. Errors of the work
+are raised as they are; an `ExecutorError` says that workers died again and again."""
 
 ExecutorName = Literal["local", "ray"]
 
@@ -51,19 +55,6 @@ ANSWER_SECONDS = 20.0
 
 class ExecutorError(RuntimeError):
     """Tasks cannot be run; the message says why, and what to do."""
-
-
-class Executor(Protocol):
-    """Runs ``work``, a function that workers can import, on tasks that can be pickled."""
-
-    def __call__(
-        self, work: Callable[[TaskT], ResultT], tasks: Sequence[TaskT], /
-    ) -> Results[ResultT]:
-        """Yield the index of each task with its result.
-
-        Raises:
-            ExecutorError: Workers died again and again. Errors of ``work`` are raised as they are.
-        """
 
 
 def this_process(work: Callable[[TaskT], ResultT], tasks: Sequence[TaskT]) -> Results[ResultT]:
@@ -252,16 +243,13 @@ def run_shown(
     No result is kept. What still runs is ended where anything goes wrong, and on Ctrl-C.
 
     Args:
-        executor: Runs the tasks.
-        work: Runs one; a function that workers can import.
-        tasks: The tasks; they can be pickled.
+        executor: Runs the tasks; see `Executor` for what it raises.
+        work: Runs one.
+        tasks: The tasks.
         take: Called with the index of each task in `tasks` and its result.
         size: Units of the bar that a task stands for.
         progress: Whether to show the bar.
         bar: Further options of `tqdm`.
-
-    Raises:
-        ExecutorError: Workers died again and again. Errors of ``work`` are raised as they are.
     """
     with (
         make_bar(sum(map(size, tasks)), shown=progress, **bar) as shown,

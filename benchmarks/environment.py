@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import tempfile
+from collections import deque
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from benchmarks.turns import Row, Work, compare, make_batch, repeating, sample, 
 from dptse_env.config import resolve
 from dptse_env.parts import make_task
 from dptse_env.release.noise import Noise, NoiseSource
-from dptse_env.traffic import RecordLibrary, draw_scenario
+from dptse_env.traffic import Corridor, RecordLibrary, draw_scenario
 from dptse_env.traffic.sumo import running
 from dptse_env.traffic.sumo import seconds as seconds_of
 from dptse_env.utils.threads import n_cores
@@ -33,7 +35,12 @@ def measure(*, quick: bool = False) -> list[Row]:
     keywords = {"traffic_seeds": "0:2" if quick else "0:64", "horizon": 600, "random_start": True}
     base = f"batch of {n:,}"
     with tempfile.TemporaryDirectory() as folder:
-        work = {"libsumo alone": simulating(), "recording": recording(Path(folder))}
+        corridor = resolve("paper-highway", {}).corridor
+        duration, libraries = corridor.conditions.duration, (Path(folder, str(k)) for k in count())
+        work: dict[str, Work] = {
+            "libsumo alone": (partial(simulate, corridor), duration),
+            "recording": (lambda: RecordLibrary(next(libraries)).get(corridor, 0), duration),
+        }
         if importlib.util.find_spec("sumo_rl"):
             work["sumo-rl, one intersection"] = intersection(60 if quick else 600)
         env = gym.make(PAPER, **keywords)
@@ -57,27 +64,11 @@ def measure(*, quick: bool = False) -> list[Row]:
     return compare(times, {name: base for name in times if name != base})
 
 
-def simulating() -> Work:
-    """Return work that simulates a scenario, incident and all, and reads nothing."""
-    corridor = resolve("paper-highway", {}).corridor
+def simulate(corridor: Corridor) -> None:
+    """Simulate the scenario that is recorded, incident and all, and read nothing."""
     scenario = draw_scenario(corridor, 0)
-
-    def turn() -> None:
-        with running(corridor, scenario) as libsumo:
-            for _ in seconds_of(libsumo, corridor, scenario):
-                pass
-
-    return turn, corridor.conditions.duration
-
-
-def recording(folder: Path) -> Work:
-    """Return work that records the same scenario to disk, in this process."""
-    corridor, libraries = resolve("paper-highway", {}).corridor, count()
-
-    def turn() -> None:
-        RecordLibrary(folder / str(next(libraries))).get(corridor, 0)
-
-    return turn, corridor.conditions.duration
+    with running(corridor, scenario) as libsumo:
+        deque(seconds_of(libsumo, corridor, scenario), maxlen=0)
 
 
 def intersection(duration: int) -> Work:
