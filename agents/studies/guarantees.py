@@ -19,7 +19,6 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-from agents.environments import make_config, quietly
 from agents.figures import (
     ERROR_TICKS,
     LABELS,
@@ -234,9 +233,7 @@ CLAIMED = [f"{noise}: {claim}" for noise, claim in product(SPEEDS, CLAIMS)]
 def true_epsilon(line: str, claimed: float) -> float:
     """Return epsilon of a kind of noise under an assumption, given as ``noise: assumption``."""
     noise, claim = line.split(": ")
-    own = priced("ekf", noise, epsilon=claimed)
-    with quietly():
-        return CLAIMS[claim](make_config(own.env, own.keywords))
+    return CLAIMS[claim](priced("ekf", noise, epsilon=claimed).config)
 
 
 # Tables, which ask for numbers of cells and so say which ones are played

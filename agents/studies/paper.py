@@ -130,21 +130,19 @@ CELLS = tuple(
 )
 
 
-class Stopwatch:
-    """Adds up the time spent in some methods of an object."""
+def time_methods(timed: Any, names: Sequence[str]) -> list[float]:
+    """Replace methods of an object by ones that append their time [s] to the list returned."""
+    seconds: list[float] = []
 
-    def __init__(self, timed: Any, names: Sequence[str]) -> None:
-        """Replace the methods of this object by timed methods."""
-        self.seconds = 0.0
-        for name in names:
-            setattr(timed, name, partial(self._call, getattr(timed, name)))
-
-    def _call(self, method: Callable[..., Any], *args: Any, **keywords: Any) -> Any:
+    def call(method: Callable[..., Any], *args: Any, **keywords: Any) -> Any:
         start = time.perf_counter()
-        try:
-            return method(*args, **keywords)
-        finally:
-            self.seconds += time.perf_counter() - start
+        found = method(*args, **keywords)
+        seconds.append(time.perf_counter() - start)
+        return found
+
+    for name in names:
+        setattr(timed, name, partial(call, getattr(timed, name)))
+    return seconds
 
 
 def measure_run_time(place: Place) -> pl.DataFrame:
@@ -160,15 +158,15 @@ def measure_run_time(place: Place) -> pl.DataFrame:
             env = gym.make(ENV, **labels, traffic_seeds=list(SEEDS), records=place.records)
         evaluate(env, SCHEDULE, SEEDS[:1])  # kernels load before anything counts
         process = unwrap(env).process
-        stopwatch = Stopwatch(process.estimator, ("predict", "update", "estimate"))
-        timed.append((labels, env, process, stopwatch))
+        seconds = time_methods(process.estimator, ("predict", "update", "estimate"))
+        timed.append((labels, env, process, seconds))
     version, rows = {"version": code_version()}, []
     for seed in SEEDS[:N_TIMED]:
-        for labels, env, process, stopwatch in timed:
-            stopwatch.seconds = 0.0
+        for labels, env, process, seconds in timed:
+            seconds.clear()
             evaluate(env, SCHEDULE, [seed])
-            seconds = stopwatch.seconds / float(process.elapsed[0])
-            rows.append({**version, **labels, "traffic_seed": seed, SECONDS: seconds})
+            step = sum(seconds) / float(process.elapsed[0])
+            rows.append({**version, **labels, "traffic_seed": seed, SECONDS: step})
     return pl.DataFrame(rows)
 
 

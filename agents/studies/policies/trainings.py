@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import polars as pl
 
-from agents.environments import make_config, quietly
-from agents.play import record
+from agents.play import Cell, record
 from agents.studies.policies import (
     CURVES,
     LEARNERS,
@@ -91,8 +90,7 @@ def train_ladder(place: Place, minutes: float, seeds: Sequence[int]) -> None:
 
 def config_of(setting: str) -> EnvConfig:
     """Return the configuration of a setting."""
-    with quietly():
-        return make_config(SETTINGS[setting].env, SETTINGS[setting].keywords)
+    return Cell(SETTINGS[setting].env, keywords=SETTINGS[setting].keywords).config
 
 
 def fits(setting: str, learner: str) -> bool:

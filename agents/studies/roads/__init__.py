@@ -156,23 +156,6 @@ def named(weights: str) -> str:
     return f"{Path(weights).name} {digest[:6]}"
 
 
-def road_cells(
-    road: str, release: str, estimator: str, weights: str = "", network: str = ""
-) -> list[Cell]:
-    """Return the cells of an estimator on a road, with weights and their name if there are any."""
-    more: dict[str, Any] = {"estimator": estimator}
-    if weights:
-        more["estimator_settings"] = {"recurrent": {"weights": weights}}
-    labels = on_road(road, release, estimator, network)
-    return [
-        Cell(
-            ROADS[road].env, "round-robin", {**keywords, **RELEASES[release], **more}, labels,
-            watchers=("honesty",), seeds=seeds,
-        )
-        for keywords, seeds in ROADS[road].parts
-    ]  # fmt: skip
-
-
 def study(weights: Sequence[str] = ()) -> Study:
     """Return the study, with some weights beside those of the package.
 
@@ -186,13 +169,22 @@ def study(weights: Sequence[str] = ()) -> Study:
     """
     weights = convert(tuple[str, ...], weights, "weights")
     who = [(name, "", "") for name in (*FILTERS, RECURRENT, MIXTURE)]
-    who += [(RECURRENT, each, named(each)) for each in weights]
-    cells = [
-        each
-        for (road, release), (estimator, own, name) in product(lines(), who)
-        if not own or member(own, release)
-        for each in road_cells(road, release, estimator, own, name)
-    ]
+    who += [(RECURRENT, named(each), each) for each in weights]
+    cells = []
+    for (name, release), (estimator, network, own) in product(lines(), who):
+        if own and not member(own, release):
+            continue
+        more: dict[str, Any] = {**RELEASES[release], "estimator": estimator}
+        if own:
+            more["estimator_settings"] = {"recurrent": {"weights": own}}
+        labels = on_road(name, release, estimator, network)
+        cells += [
+            Cell(
+                ROADS[name].env, "round-robin", {**keywords, **more}, labels,
+                watchers=("honesty",), seeds=seeds,
+            )
+            for keywords, seeds in ROADS[name].parts
+        ]  # fmt: skip
     return Study("roads", tuple(cells), SEEDS, report)
 
 
