@@ -76,12 +76,6 @@ def percent_below(table: FloatArray, reference: FloatArray) -> FloatArray:
     return 100.0 * (1.0 - interquartile_mean(table) / interquartile_mean(reference))
 
 
-def percent_of_way(table: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
-    """Return how far ``table`` has come from ``start`` to ``end`` [%], means as `percent_below`."""
-    first, last = interquartile_mean(start), interquartile_mean(end)
-    return 100.0 * (first - interquartile_mean(table)) / (first - last)
-
-
 def bootstrap(
     statistic: Callable[..., FloatArray],
     *tables: ArrayLike,

@@ -9,7 +9,6 @@ from agents.statistics import (
     interquartile_mean,
     mean_interval,
     percent_below,
-    percent_of_way,
 )
 
 
@@ -105,7 +104,3 @@ def test_the_interquartile_mean_leaves_the_best_and_the_worst_training_out_and_n
     assert interquartile_mean(table) == pytest.approx((4.5 + 2.0 + 3.0) / 3)
     few = table[[0, 3]]
     np.testing.assert_allclose(interquartile_mean(np.stack([few, few + 1.0])), [42.25, 43.25])
-
-
-def test_percent_of_the_way():
-    assert percent_of_way(np.full((5, 2), 9.0), np.full((1, 2), 10.0), np.full((1, 2), 6.0)) == 25.0

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,7 +42,7 @@ from agents.figures import (
 from agents.play import Cell
 from agents.policies import find_policy
 from agents.seeds import STUDY_TEST, TRAINING_VALIDATION
-from agents.statistics import Interval, bootstrap, interquartile_mean, percent_below, percent_of_way
+from agents.statistics import Interval, bootstrap, interquartile_mean, percent_below
 from agents.study import Place, Study, read_table
 from agents.tables import (
     ERROR,
@@ -49,6 +50,7 @@ from agents.tables import (
     UnmeasuredError,
     grid,
     paired,
+    table,
     tenths,
     values,
 )
@@ -278,18 +280,29 @@ def ranked_learners(curves: pl.DataFrame, setting: str, seed: int | None = None)
 
 # What is reported: the settings.
 
-BELOW, WAY = "below the best rule [%]", f"way from {ROUND_ROBIN} to {GAIN} [%]"
+BELOW = "below the best rule [%]"
 
 
-def compared(rows: pl.DataFrame, setting: str, policy: str, column: str) -> Interval:
-    """Return `BELOW` or `WAY` of a policy in a setting."""
-    statistic: Statistic = percent_below if column == BELOW else percent_of_way
-    others = (best_rule(rows, setting),) if column == BELOW else (ROUND_ROBIN, GAIN)
-    return measure(rows, statistic, *(played(setting, each) for each in (policy, *others)))
+def error_of(rows: pl.DataFrame, setting: str, policy: str) -> Interval:
+    """Return the error x 1000 of a policy in a setting."""
+    return measure(rows, interquartile_mean, played(setting, policy))
+
+
+def below_best_rule(rows: pl.DataFrame, setting: str, policy: str) -> Interval:
+    """Return by how much a policy errs less than the best rule of a setting [%]."""
+    both = policy, best_rule(rows, setting)
+    return measure(rows, percent_below, *(played(setting, each) for each in both))
 
 
 def summary_table(rows: pl.DataFrame, curves: pl.DataFrame) -> str:
     """Return what is to be won in each setting, and what the best learner wins."""
+
+    def error(policy: str, name: str) -> str:
+        return f"{error_of(rows, name, policy).mean:.1f}"
+
+    def rule(name: str) -> str:
+        best = best_rule(rows, name)
+        return f"{error(best, name)} (`{best}`)"
 
     def learner(name: str) -> str:
         found = ranked_learners(curves, name)
@@ -297,48 +310,38 @@ def summary_table(rows: pl.DataFrame, curves: pl.DataFrame) -> str:
             raise UnmeasuredError(name)
         return found[0]
 
-    def entry(name: str, column: str) -> str:
-        if column == "learner":
-            return learner(name)
-        if column == "file":
-            own = curves.filter(setting=name, policy=learner(name)).sort("error", "training_seed")
-            folder = training_folder(Path(), name, learner(name), own["training_seed"][0])
-            return f"`{folder.as_posix()}`"
-        if column in (BELOW, WAY):
-            return tenths(compared(rows, name, learner(name), column))
-        rule = best_rule(rows, name)
-        error = measure(
-            rows, interquartile_mean, played(name, rule if column == "best rule" else column)
-        )
-        return f"{error.mean:.1f}" + (f" (`{rule}`)" if column == "best rule" else "")
+    def file(name: str) -> str:
+        own = curves.filter(setting=name, policy=learner(name)).sort("error", "training_seed")
+        folder = training_folder(Path(), name, learner(name), own["training_seed"][0])
+        return f"`{folder.as_posix()}`"
 
-    columns = (ROUND_ROBIN, "best rule", ORACLE, GAIN, "learner", BELOW, WAY, "file")
-    return grid("setting", list(SETTINGS), columns, entry)
+    columns: dict[str, Callable[[str], str]] = {
+        ROUND_ROBIN: partial(error, ROUND_ROBIN),
+        "best rule": rule,
+        ORACLE: partial(error, ORACLE),
+        GAIN: partial(error, GAIN),
+        "learner": learner,
+        BELOW: lambda name: tenths(below_best_rule(rows, name, learner(name))),
+        "file": file,
+    }
+    return table("setting", {name: name for name in SETTINGS}, columns)
 
 
 def setting_table(rows: pl.DataFrame, curves: pl.DataFrame, setting: str) -> str:
     """Return all policies that played test traffic in a setting, the least error first."""
-    own = rows.filter(part=TEST, setting=setting)
-    errors = {
-        policy: measure(rows, interquartile_mean, played(setting, policy))
-        for policy in own["policy"].unique()
+    own = rows.filter(part=TEST, setting=setting)["policy"].unique()
+    errors = {policy: error_of(rows, setting, policy) for policy in own}
+
+    def seeds(policy: str) -> str:
+        return str(curves.filter(setting=setting, policy=policy)["training_seed"].n_unique() or "-")
+
+    columns: dict[str, Callable[[str], str]] = {
+        "error x 1000": lambda policy: tenths(errors[policy]),
+        BELOW: lambda policy: tenths(below_best_rule(rows, setting, policy)),
+        "training seeds": seeds,
     }
-
-    def entry(policy: str, column: str) -> str:
-        if column == "error x 1000":
-            return tenths(errors[policy])
-        if column in (BELOW, WAY):
-            return tenths(compared(rows, setting, policy, column))
-        trained = curves.filter(setting=setting, policy=policy)
-        if trained.is_empty():
-            raise UnmeasuredError(policy)
-        if column == "training seeds":
-            return str(trained["training_seed"].n_unique())
-        steps = trained.group_by("training_seed").agg(pl.max("steps"))["steps"].to_numpy()
-        return f"{steps.mean() / 1e6:.2f}"
-
-    columns = ("error x 1000", BELOW, WAY, "training seeds", "steps trained [10⁶]")
-    return grid("policy", sorted(errors, key=lambda each: errors[each].mean), columns, entry)
+    ranked = sorted(errors, key=lambda each: errors[each].mean)
+    return table("policy", dict(zip(ranked, ranked, strict=True)), columns)
 
 
 def _panels(titles: Iterable[str], label: str = "", **options: Any) -> tuple[Figure, list[Axes]]:
@@ -387,7 +390,7 @@ def draw_below(rows: pl.DataFrame, path: Path) -> None:
         }
         for place, (policy, look) in enumerate(looks.items()):
             try:
-                draw_dot(axis, compared(rows, name, policy, BELOW), -place, *look)
+                draw_dot(axis, below_best_rule(rows, name, policy), -place, *look)
             except UnmeasuredError:
                 continue
         axis.axvline(0.0, color=GREY, linewidth=0.8)
