@@ -13,7 +13,6 @@ import gymnasium as gym
 from gymnasium.vector import AutoresetMode
 
 from dptse_env.config import KEYWORDS, PRESETS, EnvConfig
-from dptse_env.env import SensorQueryEnv
 from dptse_env.evaluation import require_in_step
 from dptse_env.privacy import rounded_up
 from dptse_env.registration import ENVIRONMENTS
@@ -34,18 +33,6 @@ OTHER_DRIVERS: dict[str, Any] = {
     },
 }
 """Keywords of drivers and demand that no policy was trained on."""
-
-
-def unwrap(env: gym.Env[Any, Any]) -> SensorQueryEnv:
-    """Return the environment of this package under its wrappers.
-
-    Raises:
-        TypeError: It is none of this package.
-    """
-    bare = env.unwrapped
-    if not isinstance(bare, SensorQueryEnv):
-        raise TypeError(f"env must be an environment of dptse_env, got {type(bare).__name__}")
-    return bare
 
 
 def parse_env(text: str) -> tuple[str, dict[str, Any]]:
@@ -81,7 +68,9 @@ def make_config(env: str, keywords: Mapping[str, Any]) -> EnvConfig:
     Raises:
         ValueError: A keyword is unknown or out of range.
     """
-    return unwrap(gym.make(env, disable_env_checker=True, **keywords)).config
+    made = gym.make(env, disable_env_checker=True, **keywords)
+    config: EnvConfig = made.get_wrapper_attr("config")
+    return config
 
 
 def make_vector(env: str, n_episodes: int, keywords: Mapping[str, Any]) -> SensorQueryVectorEnv:

@@ -27,7 +27,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-from agents.environments import quietly, unwrap
+from agents.environments import quietly
 from agents.figures import (
     COLOURS,
     ERROR_TICKS,
@@ -157,7 +157,7 @@ def measure_run_time(place: Place) -> pl.DataFrame:
         with quietly():
             env = gym.make(ENV, **labels, traffic_seeds=list(SEEDS), records=place.records)
         evaluate(env, SCHEDULE, SEEDS[:1])  # kernels load before anything counts
-        process = unwrap(env).process
+        process = env.get_wrapper_attr("process")
         seconds = time_methods(process.estimator, ("predict", "update", "estimate"))
         timed.append((labels, env, process, seconds))
     version, rows = {"version": code_version()}, []
