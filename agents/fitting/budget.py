@@ -69,11 +69,10 @@ def advice(errors: Errors, own: float) -> str:
     bandwidth, epsilon = min(queried, key=lambda key: float(queried[key].mean()))
     best = min(column, key=lambda key: float(column[key].mean()))
     enough = min(key for key, each in column.items() if not is_less(column[best], each))
-    surely = "for certain" if len(column[best]) >= FEW else "on average"
+    certain = "certain " if len(column[best]) >= FEW else ""
     said = (
         f"The error is least at bandwidth {bandwidth} and ε = {epsilon:g}. At the environment's "
-        f"ε = {own:g} it is least at bandwidth {best}, and beyond {enough} it gets no smaller "
-        f"{surely}."
+        f"ε = {own:g} it is least at bandwidth {best}; more than {enough} is no {certain}gain."
     )
     compared = sorted(epsilon for bandwidth, epsilon in errors if not bandwidth)
     idle = [
@@ -84,9 +83,11 @@ def advice(errors: Errors, own: float) -> str:
     if not compared:
         said += " No episode without queries can be played here, to compare with."
     elif idle:
-        said += f" At ε = {', '.join(idle)} queries do not pay: none helps {surely}."
+        said += (
+            f" At ε = {', '.join(idle)} queries do not pay: they are no {certain}gain over none."
+        )
     else:
-        said += f" At each of these ε queries pay: some bandwidth helps {surely}."
+        said += f" At each of these ε queries pay: some bandwidth is a {certain}gain over none."
     if len({each.tobytes() for (bandwidth, _), each in queried.items() if bandwidth == best}) == 1:
         said += " Errors do not depend on ε: the release model has none."
     return said

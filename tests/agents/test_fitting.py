@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip("tomlkit")
 
+from agents.environments import preset_of, quietly
 from agents.executors import this_process
 from agents.fitting import choice as choosing
 from agents.fitting import parameters as searching
@@ -23,11 +24,12 @@ from agents.fitting.parameters import fit_parameters, start_from
 from agents.fitting.road import find_road
 from agents.fitting.road_file import copy_of, write_choice
 from agents.play import Cell
+from agents.seeds import KINDS
 from agents.study import Place
 from dptse_env.model import load_parameters
 from dptse_env.model.parameters import write_parameters
 from dptse_env.traffic import RecordLibrary, read_road, write_corridor
-from tests.helpers import run_killed
+from tests.helpers import run_killed, save_untrained
 from tests.scripts.commands import refused, run_command
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
@@ -133,8 +135,8 @@ def test_advice_says_where_queries_stop_paying():
     errors = {key: np.array(values, float) for key, values in ERRORS.items()}
     said = advice(errors, 5.0)
     assert "least at bandwidth 4 and ε = 5. At the environment's ε = 5" in said
-    assert "least at bandwidth 4, and beyond 2 it gets no smaller for certain" in said
-    assert "At ε = 1 queries do not pay: none helps for certain" in said
+    assert "least at bandwidth 4; more than 2 is no certain gain" in said
+    assert "At ε = 1 queries do not pay: they are no certain gain over none" in said
     assert "| no queries | 83.0 ± 4.1 | 83.0 ± 4.1 |" in budget_table(errors)
     assert budget_table(errors).endswith("| 4 | - | 51.2 ± 2.7 |")
     paid = {key: each for key, each in errors.items() if key[1] == 5.0}
@@ -277,6 +279,23 @@ def test_a_choice_changes_for_what_is_certainly_better(errors, chosen, tmp_path,
     assert (choice.estimator, choice.policy) == (chosen, "round-robin")
 
 
+def test_a_saved_policy_may_be_among_those_to_choose_from(tmp_path):
+    pytest.importorskip("sb3_contrib")
+    path = tmp_path / "my-road.toml"
+    path.write_text(ROAD)
+    road = find_road(path, ID, tmp_path, dict(zip(KINDS, ("0", "1000", "2000"), strict=True)))
+    policy = tmp_path / "mine.safetensors"
+    with quietly():
+        save_untrained(policy, preset=preset_of(ID), corridor=str(path), bandwidth=2)
+    road.cell(str(policy)).check()
+    road.begin(tmp_path, 1, 5.0)
+    place = Place(tmp_path, this_process, tmp_path / "records")
+    choice = Choice(road, place, {"w99-3lane": {"parameters": "w99-3lane"}}, parameters="w99-3lane")
+    choice.choose([{"policy": "round-robin"}, {"policy": str(policy)}])
+    assert set(choice.rows["policy"]) == {"round-robin", str(policy)}
+    assert choice.notes == []
+
+
 @pytest.mark.parametrize(
     ("table", "kept"),
     [
@@ -354,6 +373,8 @@ SHORT = ROAD.replace("segment_length = 0.1", "segment_length = [0.1, 0.1, 0.04, 
         (ROAD, ["--test-seeds", "1000:1004"], "test_seeds must be traffic seeds in 2000..2999"),
         (ROAD, ["--env", f'{ID} {{"parameters": "published"}}'], "env.parameters must be left out"),
         (ROAD, ["--estimators", "kalman"], "estimator must be one of"),
+        (ROAD, ["--policies", "all"], "schedule 'all' needs bandwidth 4, the environment has 1"),
+        (ROAD, ["--policies", "nobody.safetensors"], "there is no saved policy"),
     ],
 )
 def test_what_cannot_be_fitted_is_one_line_and_leaves_nothing(text, words, message, tmp_path):
