@@ -372,7 +372,7 @@ class Planner:
 
 
 def public_terms(
-    config: EnvConfig, record: Record, plan: BoolArray, seed: int = 0
+    config: EnvConfig, record: Record, plan: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Play an episode over a record, and return how far vehicles would move its releases.
 
@@ -380,7 +380,6 @@ def public_terms(
         config: The configuration.
         record: The traffic.
         plan: Queries, shape (T, G).
-        seed: Seeds noise and estimator.
 
     Returns:
         By how much one vehicle more, and 1 km/h more in the sum or mean of speeds, moves the
@@ -388,7 +387,7 @@ def public_terms(
         speeds [km/h], shape (T, places), NaN where mean speeds are released.
     """
     alike = Worlds.adjacent(record, (Trajectory.absent(), Trajectory.absent()))
-    played = overheard(config, alike, np.zeros(1, int), plan, [np.random.default_rng(seed)])
+    played = overheard(config, alike, np.zeros(1, int), plan, [np.random.default_rng(0)])
     rows = []
     for release in played:
         rows.append((release.last.sigma[0].copy(), release.last.centre[0].copy()))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -82,19 +81,14 @@ class Finding:
         trials = f"at most, in {result.n} runs per world"
         if result.is_one_run:
             trials = f"by the expected errors at {result.n} canaries of one run"
-        factor = self.noise_factor * distance / result.detectable
-        sensitivity = (
-            f"sensitivity: it rejects a mu of {result.detectable:.3f} with probability 95 %; this "
-            f"target has it if the noise is {factor:.3f} times the declared one"
-        )
-        if math.isinf(result.detectable):
-            few = "canaries" if result.is_one_run else "runs"
-            sensitivity = f"too few {few} to reject this claim, however much leaks"
+        most = f"without any error, so many show a mu of {result.most:.3f}"
+        if result.most <= claim.mu:
+            most += ": too few to reject this claim, however much leaks"
         lines = [
             f"worlds: {target}; queries: {policy}; noise x {self.noise_factor:g}",
             f"distance: {distance:.3f} standard deviations {trials} ({self.seconds:.0f} s), "
             f"{distance / claim.mu:.4f} times the claim",
-            sensitivity,
+            most,
             f"noise: {'rejected' if self.noise.is_rejected else 'not rejected'} by "
             f"{self.noise.n} residuals of other episodes, p = {self.noise.p_value:.2g}; "
             f"most suspect: {self.noise.suspect}",
@@ -109,12 +103,11 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as plain JSON."""
-        least = self.attack.result.detectable
         return {
             "verdict": self.verdict,
             **self.attack._asdict(),
             "result": dataclasses.asdict(self.attack.result),
-            "detectable_mu": least if math.isfinite(least) else None,
+            "most": self.attack.result.most,
             "noise": dataclasses.asdict(self.noise),
             "noise_factor": self.noise_factor,
             "privacy": self.privacy.to_dict(),

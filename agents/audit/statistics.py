@@ -37,15 +37,13 @@ wrong.
 An audit can refute a claim and never prove one. Nothing here depends on traffic.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
-from scipy.special import ndtr, ndtri
-from scipy.stats import beta, binom
+from scipy.special import ndtri
+from scipy.stats import beta
 
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.validation import (
@@ -53,8 +51,6 @@ from dptse_env.utils.validation import (
     Interval,
     checked_fields,
     inside,
-    integer,
-    positive,
     require,
 )
 
@@ -131,9 +127,12 @@ class AuditResult:
         return self.epsilon is None
 
     @property
-    def detectable(self) -> float:
-        """Least mu for which the claim is rejected with probability 95 %, or infinity."""
-        return detectable_mu(self.claim.mu, self.n, self.confidence, is_one_run=self.is_one_run)
+    def most(self) -> float:
+        """The bound on mu that as many runs or canaries show without any error."""
+        risk = 1.0 - self.confidence
+        if self.is_one_run:
+            return _least_mu(error_bound(0, self.n, risk))
+        return _least_mu(error_bound(0, self.n - self.n // 2, risk / _N_RATES))
 
     @property
     def verdict(self) -> Literal["rejected", "not rejected"]:
@@ -209,7 +208,7 @@ def audit_coins(
     risk = 1.0 - inside("confidence", confidence, 0.0, 1.0)
     errors, n = int(np.count_nonzero((told > 0.0) != thrown)), told.size
     rate = float(error_bound(errors, n, risk))
-    bound = LowerBound(max(-2.0 * float(ndtri(rate)), 0.0), 0.0, rate, rate)
+    bound = LowerBound(_least_mu(rate), 0.0, rate, rate)
     return AuditResult(claim, bound, None, confidence, n)
 
 
@@ -227,56 +226,9 @@ def error_bound(errors: npt.ArrayLike, trials: int, risk: float) -> FloatArray:
     return bounds
 
 
-def rejection_probability(
-    mu: float, claimed_mu: float, n: int, confidence: float = 0.95, *, is_one_run: bool = False
-) -> float:
-    """Power of an audit: probability that it rejects a claim on mu when the truth is `mu`.
-
-    The truth is a Gaussian release that the adversary scores by its likelihood ratio, and the
-    threshold is the optimal one, midway. Both error counts are then binomial, and the sum over them
-    is exact. `audit` has to find its threshold first, on half of the n runs per world, which
-    reduces the power by a few hundredths where it is neither near 0 nor near 1. At `mu` =
-    `claimed_mu` it is the probability of a false alarm. In one run there are n canaries.
-    """
-    mu, claimed_mu = positive("mu", mu), positive("claimed_mu", claimed_mu)
-    n = integer("n", n, 1 if is_one_run else 2)
-    risk = 1.0 - inside("confidence", confidence, 0.0, 1.0)
-    rate = float(ndtr(-0.5 * mu))
-    if is_one_run:
-        bounds = error_bound(np.arange(n + 1), n, risk)
-        return float(binom.cdf(np.count_nonzero(-2.0 * ndtri(bounds) > claimed_mu) - 1, n, rate))
-    trials = n - n // 2
-    counts = np.arange(trials + 1)
-    # Decreases in the number of errors; the two worlds' values add up to the bound on mu.
-    evidence = -ndtri(error_bound(counts, trials, risk / _N_RATES))
-    most = np.searchsorted(-evidence, evidence - claimed_mu) - 1
-    return float(np.sum(binom.pmf(counts, trials, rate) * binom.cdf(most, trials, rate)))
-
-
-def detectable_mu(
-    claimed_mu: float,
-    n: int,
-    confidence: float = 0.95,
-    probability: float = 0.95,
-    *,
-    is_one_run: bool = False,
-) -> float:
-    """Smallest true mu at which `rejection_probability` reaches the given probability.
-
-    It is infinite where so few runs cannot reject the claim at any mu.
-    """
-    probability = inside("probability", probability, 0.0, 1.0)
-
-    def excess(mu: float) -> float:
-        power = rejection_probability(mu, claimed_mu, n, confidence, is_one_run=is_one_run)
-        return power - probability
-
-    low = high = claimed_mu
-    while excess(high) < 0.0:
-        if high > claimed_mu + 50.0:  # no error is ever made there
-            return math.inf
-        low, high = high, high + 1.0
-    return high if low == high else float(brentq(excess, low, high, xtol=1e-6))
+def _least_mu(rate: npt.ArrayLike) -> float:
+    """Return the least mu at which both errors have this rate."""
+    return max(-2.0 * float(ndtri(rate)), 0.0)
 
 
 def _between(scores: FloatArray) -> FloatArray:
