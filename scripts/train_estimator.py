@@ -1,8 +1,8 @@
 r"""Train recurrent networks as an estimator, for releases of flows and of speeds.
 
-dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --seed 0 \
-    --rounds own:2:4 own:2:4 --train-seeds 0:2 --validation-seeds 1000:1001 \
-    --plan '{"windows": 2, "ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}'
+dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --seed 0 --rounds own:2:4 \
+    --validation-env dptse_env:dptse/ShortHighway-v0 --train-seeds 0:2 --validation-seeds 1000 \
+    --plan '{"ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}'
 
 Each kind and seed is a training in a folder of its own. The best weights of each kind on validation
 traffic become weights-flows.safetensors and weights-speeds.safetensors in the output folder, a
