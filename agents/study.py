@@ -116,7 +116,6 @@ def play_study(study: Study, place: Place) -> pl.DataFrame:
     Raises:
         ValueError, RecordingError, ExecutorError, OSError: See `run`.
     """
-    place.folder.mkdir(parents=True, exist_ok=True)
     _play_missing(study, study.cells, place)
     return read_rows(study.name, place.folder)
 
@@ -169,7 +168,7 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place) -> None:
     folder = place.folder / PARTS
     threads = None if place.executor is this_process else 1
     if missing:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     run_shown(
         place.executor,
         partial(_play_cell, study.name, place.records, threads),

@@ -107,8 +107,8 @@ def test_bad_cells_are_refused_before_the_first_is_played(tmp_path):
         (replace(good, keywords={"cargo": 1}), "cargo"),
     ]:
         with pytest.raises(ValueError, match=message):
-            run(small(cells=(good, bad)), Place(tmp_path, this_process))
-        assert not (tmp_path / "rows").exists()
+            run(small(cells=(good, bad)), Place(tmp_path / "new", this_process))
+        assert not (tmp_path / "new").exists()
     bad = replace(good, labels={"reward": 1})
     with pytest.raises(ValueError, match=r"labels must differ .* got 'reward'"):
         run(small(cells=(bad,)), Place(tmp_path, this_process))

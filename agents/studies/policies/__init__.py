@@ -56,7 +56,7 @@ from agents.tables import (
 )
 from dptse_env.config import parse_seeds
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.validation import positive
+from dptse_env.utils.validation import convert, positive
 
 Statistic = Callable[..., FloatArray]
 
@@ -527,7 +527,7 @@ def study(minutes: float | None = None, seeds: str = "0:5") -> Study:
     """
     if minutes is None:
         return STUDY
-    time, training_seeds = positive("minutes", minutes), parse_seeds(seeds)
+    time, training_seeds = positive("minutes", minutes), parse_seeds(convert(str, seeds, "seeds"))
 
     def follow(rows: pl.DataFrame, place: Place) -> list[Cell]:
         from agents.studies.policies.trainings import train_ladder  # noqa: PLC0415 (needs torch)
