@@ -24,6 +24,7 @@ from tyro.conf import Positional
 from agents.environments import make_config, parse_env, quietly
 from agents.executors import make_executor
 from agents.figures import save_figure
+from agents.files import check_plan, keep_plan
 from agents.fitting.budget import Errors, play_budgets
 from agents.fitting.choice import (
     ESTIMATORS_TRIED,
@@ -178,7 +179,8 @@ def fit_road(args: Args, path: Path) -> None:
     args.remark("[1/6] record traffic")
     library = args.library(road.corridor, road.all_seeds)
     dwell = road.measure_dwell(library)
-    road.begin(stages, args.trials, dwell)
+    keep_plan(folder, road.plan(args.trials))
+    road.write_played(stages, dwell)
     choice = Choice(road, args.place(stages), shipped_sets(road))
     args.remark("[2/6] fit ARZ parameters")
     density, speed = traffic_of(road.corridor, road.seeds["training"], library)
@@ -237,10 +239,9 @@ def checked_road(args: Args, path: Path, folder: Path) -> Road:
     road = find_road(path, args.env, folder, dict(zip(KINDS, given, strict=True)))
     for policy in args.policies:
         road.cell(policy).check()
-    require_output(folder, own=[STAGES])
     copy = copy_of(path)
     require_output(copy.parent, [copy.name], force=True)
-    road.check(folder / STAGES, args.trials)
+    check_plan(folder, road.plan(args.trials))
     return road
 
 

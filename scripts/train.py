@@ -19,9 +19,10 @@ from typing import Any
 import torch
 
 from agents.environments import make_config, parse_env
+from agents.files import check_plan
 from agents.training.plan import TrainingPlan
 from agents.training.run import BEST, RULES_FILE, best_rule, least
-from agents.training.run_files import check_plan, read_progress
+from agents.training.run_files import read_progress
 from agents.training.settings import PlackettLuceSettings, parse_algorithm
 from agents.training.training import train, train_all
 from dptse_env.config import parse_seeds

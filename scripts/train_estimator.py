@@ -27,13 +27,14 @@ import torch
 
 from agents.environments import make_config, parse_env, quietly
 from agents.executors import Executor, run_in_order, this_process
+from agents.files import PLAN, check_plan
 from agents.filters.highways import draw_highway
 from agents.filters.plan import FilterPlan, Round, played_by
 from agents.filters.scenarios import Kind, ScenarioRanges
 from agents.filters.training import WEIGHTS, FilterTraining
 from agents.play import record
 from agents.terminal import make_table
-from agents.training.run_files import PLAN, PROGRESS, Row, check_plan, read_progress
+from agents.training.run_files import PROGRESS, Row, read_progress
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import member_for, read_weights
 from dptse_env.utils.files import replacing, require_output

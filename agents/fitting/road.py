@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from agents.environments import parse_env, preset_of, quietly
-from agents.files import first_difference, write_json
 from agents.play import Cell
 from agents.seeds import KINDS, require_seeds
 from dptse_env.config import (
@@ -34,14 +33,14 @@ from dptse_env.traffic import (
 from dptse_env.traffic.imported import has_vehicles, recorded_seeds
 from dptse_env.traffic.sumo_input import net_xml
 from dptse_env.utils.units import HOUR
-from dptse_env.utils.validation import read_json, require
+from dptse_env.utils.validation import require
 from dptse_env.versions import code_version
 
 CHOSEN = ("parameters", "estimator", "estimator_settings")
 """Keywords of an environment that a fit decides."""
 
-BEGUN, PLAYED = "begun.json", "road.toml"
-"""Files of the arguments of a fit, and of the road that its episodes are played on."""
+PLAYED = "road.toml"
+"""File of the road that the episodes of a fit are played on."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class Road:
         keywords = {**self.keywords, "corridor": str(self.path)}
         return Cell(self.env, policy, keywords, transferred=True)
 
-    def identity(self, trials: int) -> dict[str, Any]:
+    def plan(self, trials: int) -> dict[str, Any]:
         """Return what two fits must share for one to go on with what the other has found."""
         road = self.corridor.fields()
         del road["average_dwell"], road["measured"]  # the fit itself puts them into the file
@@ -103,25 +102,9 @@ class Road:
         found: dict[str, Any] = json.loads(json.dumps(content))
         return found
 
-    def check(self, stages: Path, trials: int) -> None:
-        """Check that a folder has no fit, or one with the same identity.
-
-        Raises:
-            ValueError: It has the fit of another road, environment, seeds or version.
-        """
-        if (stages / BEGUN).exists():
-            kept = read_json(stages / BEGUN)
-            difference = first_difference(kept, self.identity(trials))
-            if difference is not None:
-                raise ValueError(
-                    f"{stages.parent} has the fit of something else: {difference}. Remove the "
-                    "folder, or choose another --output"
-                )
-
-    def begin(self, stages: Path, trials: int, dwell: float) -> None:
-        """Write down what is fitted, and the road that is played, with the dwell that it has."""
+    def write_played(self, stages: Path, dwell: float) -> None:
+        """Write the road that is played, with the dwell that it has."""
         stages.mkdir(parents=True, exist_ok=True)
-        write_json(stages / BEGUN, self.identity(trials))
         # The file that a fit leaves has more under `measured`, and is the same road.
         played = dataclasses.replace(self.corridor, measured=())
         if "average_dwell" in self.assumed:

@@ -11,14 +11,11 @@ from typing import Any
 
 import torch
 
-from agents.files import first_difference, write_json
-from dptse_env.utils.files import require_output, write_atomically
-from dptse_env.utils.validation import cut, read_json, require
+from agents.files import keep_plan
+from dptse_env.utils.files import write_atomically
+from dptse_env.utils.validation import cut
 
-PLAN, CHECKPOINT, PROGRESS = "plan.json", "checkpoint.pt", "progress.csv"
-
-FORMAT = 5
-"""Format of the files; raise it whenever their content changes its meaning."""
+CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.csv"
 
 Row = dict[str, float]
 
@@ -71,39 +68,6 @@ class TrainingFolder:
         writer.writeheader()
         writer.writerows(self.rows)
         write_atomically(self.folder / PROGRESS, text.getvalue())
-
-
-def keep_plan(folder: Path, plan: Mapping[str, Any]) -> None:
-    """Keep the plan of a training in its folder, which is made if it is missing.
-
-    Raises:
-        ValueError: As `check_plan`.
-        OSError: The folder cannot be written.
-    """
-    check_plan(folder, plan)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / PLAN, {"format": FORMAT, **plan})
-
-
-def check_plan(folder: Path, plan: Mapping[str, Any]) -> None:
-    """Check that a training can begin in a folder, or go on there.
-
-    Raises:
-        ValueError: The folder has the training of another plan, or something else, or cannot be
-            written.
-    """
-    require_output(folder, own=[PLAN])
-    path = folder / PLAN
-    if not path.exists():
-        return
-    kept = read_json(path)
-    require(isinstance(kept, dict), str(path), "the plan of a training", kept)
-    difference = first_difference(kept, {"format": FORMAT, **plan})
-    if difference is not None:
-        raise ValueError(
-            f"{folder} has the training of another plan: {difference}. Choose another --output, "
-            "or remove the folder to start over"
-        )
 
 
 def read_progress(folder: Path) -> list[Row]:

@@ -12,14 +12,14 @@ import torch
 
 from agents.environments import make_vector
 from agents.executors import Executor, ExecutorError, run_shown
-from agents.files import write_json
+from agents.files import check_plan, keep_plan, write_json
 from agents.play import record
 from agents.seeds import training_seed
 from agents.training.learning import learn
 from agents.training.plan import TrainingPlan, make_policies
 from agents.training.regression import Practice, regress
 from agents.training.run import POLICY, RULES_FILE, Run, keep_rules
-from agents.training.run_files import Row, check_plan, keep_plan, read_checkpoint
+from agents.training.run_files import Row, read_checkpoint
 from agents.training.settings import PlackettLuceSettings
 from agents.training.swaps import raise_scores, try_swaps
 from dptse_env.sb3 import RoadPolicy, SB3VecEnv

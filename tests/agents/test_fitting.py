@@ -288,7 +288,7 @@ def test_a_saved_policy_may_be_among_those_to_choose_from(tmp_path):
     with quietly():
         save_untrained(policy, preset=preset_of(ID), corridor=str(path), bandwidth=2)
     road.cell(str(policy)).check()
-    road.begin(tmp_path, 1, 5.0)
+    road.write_played(tmp_path, 5.0)
     place = Place(tmp_path, this_process, tmp_path / "records")
     choice = Choice(road, place, {"w99-3lane": {"parameters": "w99-3lane"}}, parameters="w99-3lane")
     choice.choose([{"policy": "round-robin"}, {"policy": str(policy)}])

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import polars as pl
 
+from agents.files import check_plan
 from agents.play import Cell, record
 from agents.studies.policies import (
     CURVES,
@@ -23,7 +24,7 @@ from agents.studies.policies import (
 from agents.study import Place, write_table
 from agents.training.plan import TrainingPlan
 from agents.training.run import BEST, CURVE
-from agents.training.run_files import check_plan, read_progress
+from agents.training.run_files import read_progress
 from agents.training.settings import parse_algorithm
 from agents.training.training import train_all
 from dptse_env.config import EnvConfig

@@ -19,12 +19,13 @@ from PIL import Image
 
 from agents.environments import make_vector
 from agents.executors import ExecutorError, this_process
+from agents.files import PLAN
 from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
 from agents.training import training
 from agents.training.plan import make_policies
 from agents.training.run import BEST, CURVE, POLICY, RULES, RULES_FILE, Run
-from agents.training.run_files import CHECKPOINT, PLAN, PROGRESS, read_checkpoint, read_progress
+from agents.training.run_files import CHECKPOINT, PROGRESS, read_checkpoint, read_progress
 from agents.training.settings import ALGORITHMS, parse_algorithm
 from agents.training.training import train, train_all
 from dptse_env.evaluation import evaluate
