@@ -17,9 +17,9 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from agents.environments import make_config, parse_env, quietly
 from agents.executors import make_executor
@@ -75,7 +75,7 @@ class Args(
 ):  # fmt: skip
     """Fit a road."""
 
-    road: Positional[Path | None] = None
+    road: Annotated[Path | None, Positional, arg(metavar="ROAD")] = None
     """Road file, of a road of your own, an import or a SUMO network."""
     env: str = "dptse_env:dptse/PrivateHighway-v1"
     trials: int = 60

@@ -313,7 +313,7 @@ class Policy(Import, Replacing):
     it is from. The file that it becomes, policy.safetensors, holds numbers alone.
     """
 
-    model: Annotated[Path, Positional]
+    model: Annotated[Path, Positional, arg(metavar="MODEL")]
     """The model, a .zip file."""
     env: str
     """Environment that it was trained in: an id, or an id and keywords as JSON."""

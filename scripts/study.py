@@ -13,7 +13,7 @@ import pkgutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -43,7 +43,7 @@ QUICK_SEEDS = 3
 class Args(Command, Machines, TestSeeds, Environments):
     """Play a study and write its report."""
 
-    name: tyro.conf.Positional[str]
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
     """paper, guarantees, estimators, roads, policies, suite, or your own "module:NAME"; with
     keywords as JSON, 'policies {"minutes": 1, "seeds": "0:5"}' trains for so long with so many
     seeds first, 'roads {"weights": ["my-weights"]}' and estimators play weights of your own."""

@@ -138,7 +138,7 @@ def test_what_has_the_place_of_an_option_is_told(name, old, monkeypatch):
         (["train-estimator", "--kinds", "x"], "Expected one of ('flows', 'speeds')"),
         (["import"], "Expected one of {trajectories"),
         (["import", "field", "--lanes", "3"], "Missing from dptse import field: --output PATH"),
-        (["study"], "Missing from dptse study"),
+        (["study"], "Missing from dptse study: NAME"),
     ],
 )
 def test_a_line_that_cannot_be_parsed_is_an_error_in_one_line(words, said):
