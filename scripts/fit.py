@@ -75,7 +75,7 @@ class Args(
 ):  # fmt: skip
     """Fit a road."""
 
-    road: Annotated[Path | None, Positional, arg(metavar="ROAD")] = None
+    road: Annotated[Path | None, Positional, arg(metavar="[ROAD]")] = None
     """Road file, of a road of your own, an import or a SUMO network."""
     env: str = "dptse_env:dptse/PrivateHighway-v1"
     trials: int = 60
