@@ -23,6 +23,9 @@ from dptse_env.vector_env import SensorQueryVectorEnv
 LONGEST = 40
 """Letters of a value that a heading shows."""
 
+PAPER, PRIVATE, LONG, SHORT = (f"dptse_env:{env}" for env in ENVIRONMENTS)
+"""Ids of the package's environments, as `gymnasium.make` takes them."""
+
 OTHER_DRIVERS: dict[str, Any] = {
     "corridor": {"drivers": {"model": "Krauss"}},
     "demand": {

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from agents.environments import make_config, parse_env
+from agents.environments import PRIVATE, make_config, parse_env
 from agents.filters.highways import SEGMENTS, Section, draw_highway
 from dptse_env.utils.validation import Interval, checked_fields, require
 
@@ -38,7 +38,6 @@ DELTAS = (0.05, 0.001)
 """Values of delta."""
 CLIPS, PACES = (18.0, 51.0), (0.7, 0.95)
 """Ranges of the clip [km/h] and of the pace of ``paced``."""
-PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
 
 
 def _road(**keywords: Any) -> str:

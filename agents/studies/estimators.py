@@ -18,7 +18,7 @@ from typing import Any
 import polars as pl
 from matplotlib.figure import Figure
 
-from agents.environments import OTHER_DRIVERS
+from agents.environments import OTHER_DRIVERS, PAPER, PRIVATE, SHORT
 from agents.figures import (
     ERROR_TICKS,
     LABELS,
@@ -52,8 +52,6 @@ from agents.tables import (
 )
 from dptse_env.utils.validation import convert
 
-PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
-SHORT = "dptse_env:dptse/ShortHighway-v0"
 SEEDS = tuple(range(2000, 2064))
 EKF, WALK, SMOOTHING, LEARNED = "ekf", "random_walk", "asm", "recurrent"
 ROUND_ROBIN = "round-robin"

@@ -22,7 +22,7 @@ import numpy as np
 import polars as pl
 from scipy import stats
 
-from agents.environments import make_config, quietly
+from agents.environments import LONG, PAPER, PRIVATE, SHORT, make_config, quietly
 from agents.figures import GREY, finish_figure, make_figure, save_figure
 from agents.play import Cell
 from agents.policies import find_policy, policy_name
@@ -63,8 +63,6 @@ FIGURE = "scores.png"
 
 # Cells.
 
-PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
-LONG, SHORT = "dptse_env:dptse/LongHighway-v0", "dptse_env:dptse/ShortHighway-v0"
 SEEDS, LONG_SEEDS = parse_seeds("2500:2532"), parse_seeds("2500:2508")
 """Test traffic of no other study: of roads of up to 15 segments, and of the long road."""
 

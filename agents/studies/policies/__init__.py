@@ -25,6 +25,7 @@ import polars as pl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from agents.environments import LONG, PAPER, PRIVATE, SHORT
 from agents.figures import (
     COLOURS,
     GREY,
@@ -62,8 +63,6 @@ Statistic = Callable[..., FloatArray]
 
 # What is played: rules, oracles and learned policies in settings.
 
-SHORT, PRIVATE = "dptse_env:dptse/ShortHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
-LONG, PAPER = "dptse_env:dptse/LongHighway-v0", "dptse_env:dptse/PaperHighway-v0"
 ROUND_ROBIN, ORACLE, GAIN = "round-robin", "oracle-error", "oracle-gain"
 RULES = (
     ROUND_ROBIN, "shift-ahead", "oldest-first", "largest-variance", "stale-variance",

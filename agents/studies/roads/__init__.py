@@ -22,6 +22,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
+from agents.environments import LONG, PAPER, PRIVATE
 from agents.figures import LABELS, draw_errors, save_measured
 from agents.play import Cell
 from agents.statistics import Interval
@@ -44,8 +45,6 @@ from dptse_env.estimators.recurrent import member_for, shipped_weights
 from dptse_env.utils.files import file_digest
 from dptse_env.utils.validation import convert
 
-PRIVATE, PAPER = "dptse_env:dptse/PrivateHighway-v1", "dptse_env:dptse/PaperHighway-v0"
-LONG = "dptse_env:dptse/LongHighway-v0"
 SEEDS, MORE_SEEDS = tuple(range(2000, 2008)), tuple(range(2000, 2016))
 FILTERS, RECURRENT, MIXTURE = ("ekf", "blend", "asm"), "recurrent", "mixture"
 PACED, CORRECTED = "paced", "corrected"
