@@ -17,9 +17,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from agents.environments import make_config, parse_env, quietly
+from agents.environments import PRIVATE, make_config, parse_env, quietly
 from agents.filters.highways import LANES, LENGTHS, LIMITS, SEGMENTS, Section, draw_highway
-from agents.filters.scenarios import MECHANISMS, PRIVATE, Kind, Scenario, ScenarioRanges
+from agents.filters.scenarios import MECHANISMS, Kind, Scenario, ScenarioRanges
 from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
