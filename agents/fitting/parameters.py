@@ -113,7 +113,7 @@ def fit_parameters(
     start: ARZParameters,
     densest: float,
     library: RecordLibrary,
-    tries: int,
+    trials: int,
     kept: Path,
 ) -> Fit:
     """Search the parameters with which a filter errs least, by Nelder and Mead's method.
@@ -127,7 +127,7 @@ def fit_parameters(
         start: Where the search begins.
         densest: Largest density for a lane in training traffic [veh/km]; no jam is less dense.
         library: Source of the records.
-        tries: Sets to try at most.
+        trials: Sets to try at most.
         kept: JSON file of what was tried.
     """
     limit = corridor.geometry.largest_speed_limit
@@ -136,10 +136,11 @@ def fit_parameters(
     tried: dict[tuple[float, ...], float] = {}
     if kept.exists():
         tried = {tuple(values): error for *values, error in read_json(kept)}
-    shown = make_bar(tries, desc="ARZ parameters", unit="try", mininterval=0.5)
+    shown = make_bar(trials, desc="ARZ parameters", unit="trial", mininterval=0.5)
 
     def parameters_at(values: FloatArray) -> ARZParameters:
-        v_f, jam, gamma, tau = _rounded(np.clip(values, low, high))
+        found = np.exp(np.clip(values, low, high))
+        v_f, jam, gamma, tau = (float(f"{value:.4g}") for value in found)
         return dataclasses.replace(
             start,
             free_flow_speed=v_f,
@@ -172,7 +173,7 @@ def fit_parameters(
             method="Nelder-Mead",
             bounds=list(zip(low, high, strict=True)),
             options={
-                "maxfev": tries,
+                "maxfev": trials,
                 "xatol": 5e-3,
                 "fatol": 5e-3,
                 "initial_simplex": np.vstack([first, first + np.diag(steps)]),
@@ -196,11 +197,6 @@ def filter_error(cell: Cell, parameters: ARZParameters, library: RecordLibrary) 
     cell = dataclasses.replace(cell, keywords=keywords, watchers=())
     rows = play(cell, cell.seeds or (), library)
     return float(np.mean([-1000.0 * row["reward"] for row in rows]))
-
-
-def _rounded(values: FloatArray) -> list[float]:
-    """Return values given by their logarithms, to four digits."""
-    return [float(f"{value:.4g}") for value in np.exp(values)]
 
 
 def _at_bounds(
