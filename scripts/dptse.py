@@ -55,6 +55,7 @@ RENAMED: dict[str, dict[str, str]] = {
         "--rules": "--policies",
         "--seeds": "--train-seeds",
         "--schedule": "--policies",
+        "--variant": "the name that you give the file",
     },
     "import": {
         "--keywords": "part of --env, 'ID {JSON}'",
