@@ -104,7 +104,6 @@ def write_settings(
     privacy: str,
     settings: Mapping[str, Any],
     provenance: Mapping[str, Any],
-    variant: str = "",
 ) -> None:
     """Write tuned fields of `EstimatorSettings` and how they were tuned as JSON.
 
@@ -114,7 +113,7 @@ def write_settings(
     entry = {
         "estimator": estimator, "settings": dict(settings), "provenance": dict(provenance),
     }  # fmt: skip
-    name = settings_name(estimator, parameters, privacy, variant)
+    name = settings_name(estimator, parameters, privacy)
     text = json.dumps({name: entry}, indent=2) + "\n"
     _parse(_entry(json.loads(text), str(path)), str(path))
     Path(path).write_text(text, encoding="utf-8")
