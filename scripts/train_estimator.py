@@ -39,7 +39,7 @@ from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import member_for, read_weights
 from dptse_env.utils.files import replacing, require_output
 from dptse_env.utils.progress import make_bar
-from dptse_env.utils.validation import from_mapping, parse_json, require
+from dptse_env.utils.validation import from_mapping, parse_json, require, within
 from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, ValidationSeeds
 
 NAME = "weights"
@@ -97,8 +97,11 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
         ValueError: An argument is out of range.
     """
     traffic, initial = parse_seeds(args.train_seeds, "train_seeds"), None
+    width, continued = FilterPlan.width, {}
     if args.initial is not None:
-        initial = member_for(args.initial, kind == "flows")
+        initial, continued = member_for(args.initial, kind == "flows"), CONTINUED
+        with within("initial: "):
+            width = read_weights(initial).weights.width
     ranges = ScenarioRanges(envs=args.env) if args.env else ScenarioRanges()
     with quietly():
         roads = [make_config(*parse_env(each)).corridor for each in ranges.envs]
@@ -110,11 +113,11 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
         validation_envs=args.validation_env,
         ranges=ranges,
         rounds=tuple(parse_round(each) for each in args.rounds),
-        width=FilterPlan.width if initial is None else read_weights(initial).weights.width,
+        width=width,
         windows=min(FilterPlan.windows, len(traffic)),
         seconds=min(FilterPlan.seconds, *(road.conditions.duration for road in roads)),
         initial=initial,
-        **(CONTINUED if initial is not None else {}),
+        **continued,
     )
     return from_mapping(FilterPlan, parse_json(args.plan, "plan"), "plan", plan)
 

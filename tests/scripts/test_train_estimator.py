@@ -72,6 +72,7 @@ def test_rounds_are_read_from_text():
     [
         (["--train-seeds", "0:2000"], r"train_seeds must be traffic seeds in 0\.\.999"),
         (["--rounds", "own:0:4"], r"rounds\.scenarios must be an integer in 1\.\."),
+        (["--initial", "nowhere"], "initial: .*weights must be a file or one of highway, "),
         (["--plan", "[3]"], "plan must be a mapping"),
         (["--plan", "{"], "plan must be JSON: "),
         (["--plan", '{"wide": 3}'], r"plan\.wide is unknown"),
