@@ -206,7 +206,12 @@ def fit_road(args: Args, path: Path) -> None:
     policies = args.policies or POLICIES_TRIED
     choice.choose([{"policy": each} for each in policies])
     args.remark("[6/6] evaluate on test traffic, and over bandwidth and epsilon")
-    played = choice.play(test_cells(choice, estimators, policies))
+    wanted = [
+        {}, {"estimator": FILTER, "policy": ROUND_ROBIN}, {"policy": ROUND_ROBIN},
+        *({"estimator": each, "policy": ROUND_ROBIN} for each in estimators),
+        *({"policy": each} for each in policies),
+    ]  # fmt: skip
+    played = choice.play([choice.plain, *(choice.labels("test", **each) for each in wanted)])
     budgets = play_budgets(choice)
 
     keywords = chosen_keywords(choice, road)
@@ -315,20 +320,6 @@ def note_parameters(choice: Choice, fit: Fit) -> None:
             "certain gain; --keep-fitted writes them"
         )
     choice.notes += fit.at_bounds
-
-
-def test_cells(
-    choice: Choice, estimators: Sequence[str], policies: Sequence[str]
-) -> list[dict[str, str]]:
-    """Return what is played on test traffic: what was chosen, and what it is compared with."""
-    plain = {"estimator": FILTER, "policy": ROUND_ROBIN}
-    changes: list[dict[str, str]] = [
-        {}, {"parameters": choice.home, **plain}, plain, {"policy": ROUND_ROBIN},
-        *({"estimator": each, "policy": ROUND_ROBIN} for each in estimators),
-        *({"policy": each} for each in policies),
-    ]  # fmt: skip
-    wanted = [choice.labels("test", **each) for each in changes]
-    return [dict(each) for each in dict.fromkeys(tuple(labels.items()) for labels in wanted)]
 
 
 def chosen_keywords(choice: Choice, road: Road) -> dict[str, Any]:

@@ -75,6 +75,16 @@ class Choice:
         inherited = self.road.inherited
         return inherited if inherited in self.sets else next(iter(self.sets))
 
+    @property
+    def tested(self) -> Labels:
+        """Labels of what is chosen on test traffic."""
+        return self.labels("test")
+
+    @property
+    def plain(self) -> Labels:
+        """Labels of what it is held against there."""
+        return self.labels("test", parameters=self.home, estimator=FILTER, policy=ROUND_ROBIN)
+
     def labels(self, traffic: str, **changes: Any) -> dict[str, Any]:
         """Return the labels of what is chosen, with changes, on a kind of traffic."""
         config = self.road.config

@@ -20,13 +20,15 @@ from agents.figures import (
     save_figure,
 )
 from agents.fitting.budget import SEEDS, Errors, advice, budget_table
-from agents.fitting.choice import FILTER, ROUND_ROBIN, Choice, interval
+from agents.fitting.choice import Choice, interval
 from agents.page import watch
 from agents.statistics import mean_interval
 from agents.tables import DENSITY, ERROR, SPEED, Labels, error_label, markdown, values
 from dptse_env.model import ARZParameters
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import write_atomically
+
+QUANTITIES = "density", "speed"
 
 PAGE, DIAGRAM, EPISODE = "fit.md", "speed-density.png", "episode.png"
 """Files in the folder of a fit."""
@@ -46,7 +48,7 @@ def write_page(
     """
     road = choice.road
     n, seed = len(road.seeds["test"]), road.seeds["test"][0]
-    config = choice.cell(choice.labels("test")).config
+    config = choice.cell(choice.tested).config
     save_figure(
         draw_episode(choice, seed), folder / EPISODE, f"{road.corridor.name}, traffic seed {seed}"
     )
@@ -67,7 +69,9 @@ def write_page(
         f"Error x 1000 of what was chosen, on the first {min(n, SEEDS)} episodes:",
         budget_table(budgets),
         advice(budgets, road.config.privacy.epsilon),
-        *tables(choice, played),
+        "## What was compared",
+        f"Plain is an EKF with {choice.home} and a round robin; what was chosen is in bold.",
+        table(choice, played),
         "## Traffic",
         f"![Speeds over densities of a lane, and the curve of each set of parameters]({DIAGRAM})",
         "v_f is a shape of the curve, not a speed that anyone drives.",
@@ -82,20 +86,18 @@ def write_page(
 
 def verdict(choice: Choice) -> str:
     """Return the result in two sentences."""
-    chosen = choice.labels("test")
-    home = choice.labels("test", parameters=choice.home, estimator=FILTER, policy=ROUND_ROBIN)
-    errors = [interval(values(choice.rows, each, ERROR)) for each in (chosen, home)]
+    errors = [interval(values(choice.rows, each, ERROR)) for each in (choice.tested, choice.plain)]
     return (
         f"On {choice.road.corridor.name} take the estimator {choice.estimator} with the parameters "
         f"{choice.parameters}, and the query policy {choice.policy}: its error x 1000 on test "
         f"traffic is {errors[0]}, that of an EKF with the inherited parameters {choice.home} and a "
-        f"round robin {errors[1]} (difference {against(choice, chosen, home)})."
+        f"round robin {errors[1]} (difference {against(choice, choice.tested)})."
     )
 
 
-def against(choice: Choice, labels: Labels, reference: Labels) -> str:
-    """Return by how many per cent a cell errs more than another one, paired by traffic."""
-    own, other = (values(choice.rows, each, ERROR) for each in (labels, reference))
+def against(choice: Choice, labels: Labels) -> str:
+    """Return by how many per cent a cell errs more than the plain one, paired by traffic."""
+    own, other = (values(choice.rows, each, ERROR) for each in (labels, choice.plain))
     difference = 100.0 * (own - other) / other.mean()
     if len(own) < 2:
         return f"{difference[0]:+.1f} %"
@@ -103,36 +105,19 @@ def against(choice: Choice, labels: Labels, reference: Labels) -> str:
     return f"{found.mean:+.1f} ± {found.half_width:.1f} %"
 
 
-def tables(choice: Choice, played: Sequence[Labels]) -> list[str]:
-    """Return titles and tables of parameters, estimators and policies, the smallest error first."""
-    parts = list[str]()
-    robin = choice.labels("test", policy=ROUND_ROBIN)
-    ekf = {**robin, "estimator": FILTER}
-    for key, title, first in (
-        ("parameters", "Parameters, with an EKF and a round robin", ekf),
-        ("estimator", f"Estimators, with {choice.parameters} and a round robin", robin),
-        ("policy", f"Query policies, with {choice.parameters} and {choice.estimator}", robin),
-    ):
-        rows = [each for each in played if {**each, key: ""} == {**first, key: ""}]
-        references = {**ekf, "parameters": choice.home}, ekf, robin
-        reference = next((each for each in references if each in rows), rows[0])
-        parts += [f"## {title}", _table(choice, key, rows, reference)]
-    return parts
-
-
-def _table(choice: Choice, key: str, rows: Sequence[Labels], reference: Labels) -> str:
-    """Return a table of what differs in one label, the chosen row in bold."""
+def table(choice: Choice, played: Sequence[Labels]) -> str:
+    """Return a table of what was played on test traffic, the smallest error first."""
     body = []
-    for labels in sorted(rows, key=lambda each: float(values(choice.rows, each, ERROR).mean())):
-        name = f"**{labels[key]}**" if labels == choice.labels("test") else labels[key]
+    for labels in sorted(played, key=lambda each: float(values(choice.rows, each, ERROR).mean())):
+        names = [labels[key] for key in ("parameters", "estimator", "policy")]
+        if labels == choice.tested:
+            names = [f"**{name}**" for name in names]
         errors = [interval(values(choice.rows, labels, each)) for each in (ERROR, DENSITY, SPEED)]
-        more = "-" if labels == reference else against(choice, labels, reference)
-        chi2 = [
-            f"{values(choice.rows, labels, f'chi2_{q}').mean():.2f}" for q in ("density", "speed")
-        ]
-        body.append([name, *errors, more, *chi2])
-    head = map(error_label, (ERROR, DENSITY, SPEED))
-    return markdown(["", *head, f"against {reference[key]}", "χ² density", "χ² speed"], body)
+        more = "-" if labels == choice.plain else against(choice, labels)
+        chi2 = [f"{values(choice.rows, labels, f'chi2_{q}').mean():.2f}" for q in QUANTITIES]
+        body.append([*names, *errors, more, *chi2])
+    head = "parameters", "estimator", "policy", *map(error_label, (ERROR, DENSITY, SPEED))
+    return markdown([*head, "against plain", *(f"χ² {q}" for q in QUANTITIES)], body)
 
 
 def draw_diagram(
@@ -166,7 +151,7 @@ def draw_diagram(
 
 def draw_episode(choice: Choice, seed: int) -> Figure:
     """Draw truth, estimate and queries of an episode of test traffic, as it was chosen."""
-    cell = choice.cell(choice.labels("test"))
+    cell = choice.cell(choice.tested)
     episode = watch(choice.policy, cell, seed, choice.place.records)
     history = episode.history
     panels = [
