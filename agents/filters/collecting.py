@@ -81,7 +81,7 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) 
         estimator: Keywords ``estimator`` and ``estimator_settings``.
         records: Library of records, or its folder; None for the user's cache.
     """
-    seeds, library = scenario.traffic_seeds, open_library(records)
+    seeds, library = scenario.seeds, open_library(records)
     keywords = {**scenario.keywords, **estimator, "traffic_seeds": list(seeds), "records": library}
     # One thread, so that the estimator is given all episodes in one call.
     keywords |= {"action": "scores", "threads": 1}
@@ -101,8 +101,8 @@ def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
     process.estimator = recorder  # type: ignore[assignment]
     evaluate(
         env,
-        scenario.schedule,
-        scenario.traffic_seeds,
+        scenario.policy,
+        scenario.seeds,
         scenario.noise_seed,
         watchers=[lambda _: recorder],
     )

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from agents.environments import PRIVATE, make_config, parse_env
 from agents.filters.highways import SEGMENTS, Section, draw_highway
+from agents.play import Cell
 from dptse_env.utils.validation import Interval, checked_fields, require
 
 Kind = Literal["flows", "speeds"]
@@ -91,23 +92,14 @@ drivers; a road of 1 km with two lanes, and one of 2 km with four."""
 
 
 @dataclass(frozen=True)
-class Scenario:
-    """One environment with a query policy, played on several traffic seeds.
+class Scenario(Cell):
+    """A cell with its traffic seeds, without an estimator.
 
     Attributes:
-        env: Environment id.
-        keywords: Keywords of the environment, without estimator and traffic seeds.
-        schedule: Query schedule.
-        traffic_seeds: Traffic seeds.
-        noise_seed: Noise and estimators are seeded with this plus the traffic seed.
         section: The road, where it is a section of a highway.
     """
 
-    env: str
-    keywords: dict[str, Any] = field(hash=False)
-    schedule: str
-    traffic_seeds: tuple[int, ...]
-    noise_seed: int
+    seeds: tuple[int, ...] = ()
     section: Section | None = None
 
 
@@ -189,8 +181,8 @@ class ScenarioRanges:
         return Scenario(
             env=env,
             keywords={**keywords, "privacy": privacy, "bandwidth": bandwidth},
-            schedule=str(rng.choice(self.schedules)),
-            traffic_seeds=seeds,
+            policy=str(rng.choice(self.schedules)),
+            seeds=seeds,
             noise_seed=int(rng.integers(10**6, 2 * 10**6)),
             section=section,
         )

@@ -62,7 +62,7 @@ def test_scenarios_cover_their_ranges():
     scenarios = drawn(n=200)
     privacy = [each.keywords["privacy"] for each in scenarios]
     assert {each["preset"] for each in privacy} == set(MECHANISMS["flows"])
-    assert {each.schedule for each in scenarios} == set(SCHEDULES)
+    assert {each.policy for each in scenarios} == set(SCHEDULES)
     epsilons = np.array([each["epsilon"] for each in privacy])
     assert 0.5 <= epsilons.min() < 0.7
     assert 14.0 < epsilons.max() <= 20.0
@@ -72,8 +72,8 @@ def test_scenarios_cover_their_ranges():
     assert bandwidths.count(1) > 2 * bandwidths.count(6)
     assert any("query_spans" in each.keywords for each in scenarios)
     for each in scenarios:
-        assert len(set(each.traffic_seeds)) == 4
-        assert set(each.traffic_seeds) <= set(range(20))
+        assert len(set(each.seeds)) == 4
+        assert set(each.seeds) <= set(range(20))
     assert drawn(n=5) == drawn(n=5) != drawn(n=5, seed=1)
     presets = {each.keywords["privacy"]["preset"] for each in drawn(kind="speeds")}
     assert presets == set(MECHANISMS["speeds"])
@@ -216,10 +216,10 @@ def test_the_network_with_gradients_is_the_estimator(mechanism, tmp_path):
     write_weights(tmp_path / "weights.safetensors", network.weights(), card())
     own, scenario = played_by(tmp_path / "weights.safetensors"), mixed(mechanism)
     collected = collect(scenario, own, None)
-    keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.traffic_seeds)}
+    keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.seeds)}
     env, seen = make_vector(SHORT, 2, {**keywords, "action": "scores"}), Seen()
-    seeds, noise = scenario.traffic_seeds, scenario.noise_seed
-    evaluate(env, scenario.schedule, seeds, noise, watchers=[seen.begin])
+    seeds, noise = scenario.seeds, scenario.noise_seed
+    evaluate(env, scenario.policy, seeds, noise, watchers=[seen.begin])
     batch, T = Batch([collected.pick(np.arange(2))]), collected.corridor.conditions.duration
     for (_, present), estimate in zip(steps(network, batch, T), seen.estimates[1:], strict=True):
         said = present.reshape(*estimate.density.shape, 4)
