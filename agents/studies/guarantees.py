@@ -9,9 +9,9 @@ budget. All cells have the same traffic; a number of one part is never held agai
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
-from itertools import chain, pairwise, product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -32,7 +32,6 @@ from agents.figures import (
     set_log,
 )
 from agents.play import Cell
-from agents.statistics import Interval, mean_interval
 from agents.study import Study
 from agents.tables import (
     DENSITY,
@@ -45,9 +44,7 @@ from agents.tables import (
     grid,
     markdown,
     mean,
-    pick,
 )
-from agents.watchers import LENGTHS
 from dptse_env.config import EnvConfig
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of, mu_of, rounded_up
@@ -148,8 +145,6 @@ QUERIES: dict[str, dict[str, Any]] = {
     "3 sums of 2": {"bandwidth": 6, "query_spans": [2], "bandwidth_unit": "segments"},
 }
 """Queries of a second; a sum is over neighbouring segments."""
-SAME_COST = ("5 segments", "5 sums of 2")
-FILTERS = ("ekf-demand", "ukf-demand", "enkf-demand", "mhe-demand", "random_walk")
 CURVE = (0.5, 1.0, 2.0, 5.0, 10.0)
 VARIANTS: dict[str, dict[str, Any]] = {
     "a trip, replaced": {},
@@ -314,15 +309,6 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
     }
     again = {name: (DENSITY, partial(paid, **changes)) for name, changes, _ in LADDER}
     yield sweep(ask, "rung", at, again)
-    yield "## Filters with demand states, and the random walk, `paced`"
-    filters = {
-        f"{queries}, {LABELS[each.partition('-')[0]]}": (
-            paid(estimator=each, queries=queries),
-            paid(queries=queries),
-        )
-        for queries, each in product(SAME_COST, FILTERS)
-    }
-    yield compared(ask, "EKF", filters, REFUSED)
     capped = partial(paid, **CAPPED)
     lines: dict[str, Line] = {}
     for column, name in (ERRORS | {REFUSED: REFUSED}).items():
@@ -353,41 +339,6 @@ def number(rows: pl.DataFrame, column: str, own: Cell, base: Cell | None = None)
     if base is None:
         return format_interval(mean(rows, own.labels, column))
     return format_interval(difference(rows, own.labels, base.labels, column))
-
-
-def equal_errors(rows: pl.DataFrame) -> str:
-    """Return the epsilons at which ``paced`` has the density error of ``capped`` at 5.
-
-    The interval holds every epsilon at which the paired difference may be zero.
-    """
-    references: dict[str, Callable[..., Cell]] = {
-        "demand states, `round-robin`": paid,
-        "EKF, `shift-ahead`": partial(paid, estimator="ekf", schedule="shift-ahead"),
-    }
-    columns = {f"δ = {delta:g}": {"delta": delta} for delta in (DELTA, STRICT)}
-
-    def entry(line: str, head: str) -> str:
-        reference = references[line](**CAPPED, **columns[head]).labels
-        own = [paid(epsilon=each, **columns[head]).labels for each in CURVE]
-        excess = [difference(rows, each, reference, DENSITY) for each in own]
-        middle, low, high = (
-            crossing(CURVE, [getattr(each, end) for each in excess])
-            for end in ("mean", "low", "high")
-        )
-        return format_interval(Interval(middle, low, high, excess[0].n))
-
-    return grid("`capped` at ε = 5", list(references), list(columns), entry)
-
-
-def crossing(places: Sequence[float], values: Sequence[float]) -> float:
-    """Return where falling values cross zero, linear in the logarithm of their places.
-
-    Returns:
-        0 if all values are below zero, infinity if none is.
-    """
-    falling = np.minimum.accumulate(values)[::-1]
-    where = np.interp(0.0, falling, np.log(places)[::-1], left=math.inf, right=-math.inf)
-    return float(np.exp(where))
 
 
 PRICE_NOTE = (
@@ -440,21 +391,6 @@ def draw_price(rows: pl.DataFrame) -> Figure:
     return finish_figure(figure)
 
 
-def draw_claimed(_: pl.DataFrame) -> Figure:
-    """Draw epsilon claimed against epsilon true."""
-    figure = make_figure(6.4, 4.4, dpi=120)
-    axis = figure.subplots()
-    axis.plot(EPSILONS, EPSILONS, color=LOOKS[TRIP].colour, label="as claimed")
-    for line, style in zip(CLAIMED, 2 * ("--", ":", "-"), strict=True):
-        true = [true_epsilon(line, each) for each in EPSILONS]
-        colour = LOOKS[line.split(": ")[0]].colour
-        axis.plot(EPSILONS, true, style, color=colour, label=line.replace("`", ""))
-    set_log(axis, EPSILONS, [10.0**k for k in range(-1, 7)])
-    axis.set_xlabel("ε claimed")
-    axis.set_ylabel("ε true")
-    return finish_figure(figure, columns=2)
-
-
 def draw_ladder(rows: pl.DataFrame) -> Figure:
     """Draw the errors of every rung, from top to bottom."""
     rungs = {
@@ -466,52 +402,9 @@ def draw_ladder(rows: pl.DataFrame) -> Figure:
     return draw_errors(list(rungs), {"": rungs})
 
 
-def draw_budgets(rows: pl.DataFrame) -> Figure:
-    """Draw the contributions that were refused, by length of trip and by place."""
-    figure = make_figure(9.8, 4.4, dpi=120)
-    axes = figure.subplots(1, 2)
-    looks = {"capped": Look("#d55e00", "v"), "paced": Look("#0072b2", "o")}
-    for axis, suffix in zip(axes, ("_of", ""), strict=True):
-        for k, (release, schedule) in enumerate(product(looks, ("round-robin", "shift-ahead"))):
-            look = looks[release]._replace(line="-" if schedule == "round-robin" else "--")
-            found = pick(rows, paid(release=release, schedule=schedule).labels)
-            shares = refused_shares(found, suffix)
-            places = [place + 0.09 * (k - 1.5) for place in shares]
-            draw_curve(axis, places, list(shares.values()), look, f"{release}, {schedule}")
-        axis.set_ylim(bottom=0.0)
-    bins = [*(f"{a}–{b}" for a, b in pairwise(LENGTHS)), f"{LENGTHS[-1]}+"]
-    axes[0].set_xticks(range(len(bins)), bins)
-    axes[0].set_xlabel("time on the mainline [s]")
-    axes[1].set_xlabel("mainline segment")
-    axes[0].set_ylabel("contributions refused [%]")
-    return finish_figure(figure)
-
-
-def refused_shares(rows: pl.DataFrame, suffix: str) -> dict[int, Interval]:
-    """Return the mean share of contributions that were refused [%], by place in the lists.
-
-    Seeds without any contribution are left out, and so are places with fewer than two seeds.
-
-    Args:
-        rows: Rows of a cell.
-        suffix: ``_of`` by length of trip, nothing by segment.
-    """
-    refused, met = (
-        np.array(rows[f"{name}{suffix}"].to_list(), dtype=np.float64).T
-        for name in ("refused", "met")
-    )
-    return {
-        place: mean_interval(100.0 * part[whole > 0.0] / whole[whole > 0.0])
-        for place, (part, whole) in enumerate(zip(refused, met, strict=True))
-        if (whole > 0.0).sum() > 1
-    }
-
-
 FIGURES = {
     "fig_price.png": (draw_price, f"Errors against the claimed ε, δ = {DELTA:g}"),
-    "fig_claimed.png": (draw_claimed, f"ε claimed and true, δ = {DELTA:g}"),
     "fig_ladder.png": (draw_ladder, f"(ε, δ) = (5, {DELTA:g}) for a whole trip, replaced"),
-    "fig_budgets.png": (draw_budgets, "Who runs out (true traffic, for evaluation alone)"),
 }
 
 
@@ -534,8 +427,6 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
             "# What paced ledgers save",
             LEDGER_NOTE,
             *ledger_tables(ask),
-            "## Equal density errors",
-            equal_errors(rows),
         ]
     )
 
