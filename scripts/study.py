@@ -30,7 +30,7 @@ from scripts.cli import Command, Environments, Machines, TestSeeds
 STUDIES = {
     "paper": "agents.studies.paper:STUDY",
     "guarantees": "agents.studies.guarantees:STUDY",
-    "estimators": "agents.studies.estimators:study",
+    "estimators": "agents.studies.estimators:STUDY",
     "roads": "agents.studies.roads:study",
     "policies": "agents.studies.policies:study",
     "suite": "agents.studies.suite:STUDY",
@@ -46,7 +46,7 @@ class Args(Command, Machines, TestSeeds, Environments):
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
     """paper, guarantees, estimators, roads, policies, suite, or your own "module:NAME"; with
     keywords as JSON, 'policies {"minutes": 1, "seeds": "0:5"}' trains for so long with so many
-    seeds first, 'roads {"weights": ["my-weights"]}' and estimators play weights of your own."""
+    seeds first, 'roads {"weights": ["my-weights"]}' plays weights of your own."""
     report: bool = False
     """Write tables and figures of the rows that are there, and play nothing."""
     quick: bool = False

@@ -8,10 +8,9 @@ queries, beside three detectors on the mainline that count every vehicle.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
-from itertools import chain, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from agents.figures import (
     set_log,
 )
 from agents.play import Cell
-from agents.statistics import Interval, mean_interval
+from agents.statistics import Interval
 from agents.study import Study
 from agents.tables import (
     DENSITY,
@@ -44,13 +43,10 @@ from agents.tables import (
     format_interval,
     format_range,
     give_or_take,
-    grid,
     mean,
-    paired,
     table,
     tenths,
 )
-from dptse_env.utils.validation import convert
 
 SEEDS = tuple(range(2000, 2064))
 EKF, WALK, SMOOTHING, LEARNED = "ekf", "random_walk", "asm", "recurrent"
@@ -60,24 +56,20 @@ ROUND_ROBIN = "round-robin"
 
 QUICK, SLOW_FILTERS = (EKF, WALK, "blend", SMOOTHING, LEARNED), ("ukf", "enkf", "mhe")
 EVERYONE = (*QUICK, *SLOW_FILTERS)
-POLICIES = ("shift-ahead", ROUND_ROBIN, "oldest-first", "stale-variance", "largest-deviation")
-SHIPPED = "private-highway-capped"
-"""A learned query policy for the world `CAPPED`, trained with the EKF."""
-CAPPED = "PrivateHighway-v1, capped"
 World = tuple[str, dict[str, Any]]
 """An environment and its keywords."""
 _SUMS = {"query_spans": [2], "bandwidth_unit": "sums"}
 WORLDS: dict[str, World] = {
     "PaperHighway-v0": (PAPER, {}),
     "PaperHighway-v0, corrected": (PAPER, {"privacy": "corrected"}),
-    CAPPED: (PRIVATE, {"privacy": "capped"}),
+    "PrivateHighway-v1, capped": (PRIVATE, {"privacy": "capped"}),
     "PrivateHighway-v1": (PRIVATE, {}),
     "PrivateHighway-v1, five sums": (PRIVATE, _SUMS),
     "PrivateHighway-v1, ε = 1": (PRIVATE, {"epsilon": 1.0}),
     "PrivateHighway-v1, ε = 1, five sums": (PRIVATE, {"epsilon": 1.0, **_SUMS}),
 }
 MAIN = tuple(WORLDS)[:4]
-"""Worlds in which estimators meet query policies."""
+"""Worlds of the figure."""
 _INCIDENT = {"segment": 10, "phases": [[200.0, 400.0, 10.08], [400.0, 500.0, 50.95]]}
 ELSEWHERE: dict[str, World] = {
     "no incident": (PRIVATE, {"incident": "none"}),
@@ -93,47 +85,30 @@ MOVED = (EKF, WALK, SMOOTHING, LEARNED)
 MOVED_SEEDS = SEEDS[:24]
 
 
-def in_world(
-    world: str, estimator: str = LEARNED, policy: str = ROUND_ROBIN, network: int = 0
-) -> Labels:
-    """Return the labels of an estimator in a world."""
-    labels = {"world": world, "estimator": estimator, "policy": policy, "network": network}
+def in_world(world: str, estimator: str = LEARNED) -> Labels:
+    """Return the labels of an estimator in a world; network 0 has the weights of the package."""
+    labels = {"world": world, "estimator": estimator, "policy": ROUND_ROBIN, "network": 0}
     return {"part": "estimators", **labels}
 
 
-def world_cell(
-    world: str,
-    estimator: str,
-    policy: str = ROUND_ROBIN,
-    *,
-    network: int = 0,
-    weights: str = "highway",
-) -> Cell:
-    """Return the cell of an estimator in a world; network 0 has the weights of the package."""
+def world_cell(world: str, estimator: str) -> Cell:
+    """Return the cell of an estimator in a world."""
     env, changes = {**WORLDS, **ELSEWHERE}[world]
     keywords = {**changes, "estimator": estimator}
     if estimator == LEARNED:
-        keywords["estimator_settings"] = {"recurrent": {"weights": weights}}
+        keywords["estimator_settings"] = {"recurrent": {"weights": "highway"}}
     return Cell(
         env,
-        policy,
+        ROUND_ROBIN,
         keywords,
-        in_world(world, estimator, policy, network),
-        transferred=policy == SHIPPED,
+        in_world(world, estimator),
         watchers=("honesty",),
         seeds=MOVED_SEEDS if world in ELSEWHERE else None,
     )
 
 
 WORLD_CELLS = [
-    world_cell(*each)
-    for each in (
-        *product(MAIN, QUICK, POLICIES),
-        *product([CAPPED], QUICK, [SHIPPED]),
-        *product(MAIN, SLOW_FILTERS, ["shift-ahead", ROUND_ROBIN]),
-        *product(tuple(WORLDS)[4:], EVERYONE),
-        *product(ELSEWHERE, MOVED),
-    )
+    world_cell(*each) for each in (*product(WORLDS, EVERYONE), *product(ELSEWHERE, MOVED))
 ]
 
 # ---- The second part: a share of the vehicles answers, beside detectors. ----
@@ -148,21 +123,20 @@ DETECTORS = (3, 7, 11)
 BOTH, QUERIES, PART, WHOLE = ("both", "queries", "detectors", "detectors, whole budget")
 EPSILON, WHOLE_EPSILON = 5.0, 8.449590646976443
 """Epsilon of both mechanisms; the second one makes the detectors' part worth `EPSILON`."""
-FACTORS = {"high": 4.0 / 3.0, "low": 2.0 / 3.0}
-"""Factor on the counts of a detector that miscounts."""
-FAULTY_RELEASES = ("printed", "paced")
-RANKED = (ROUND_ROBIN, "shift-ahead", "oldest-first", "largest-variance", "static")
-RANKED_SHARES = ("100 %", "30 %", "10 %", "3 %")
 SENSED_SEEDS = SEEDS[:20]
 
 
 def sensed(
-    release: str, estimator: str, share: float = BASE_SHARE, sensors: str = BOTH, **changes: Any
+    release: str,
+    estimator: str,
+    share: float = BASE_SHARE,
+    sensors: str = BOTH,
+    policy: str = ROUND_ROBIN,
 ) -> Labels:
     """Return the labels of an estimator with some sensors at a share of connected vehicles."""
     labels = {"release": release, "estimator": estimator, "share": share, "sensors": sensors}
-    others = {"policy": ROUND_ROBIN, "fault": "none", "detector": -1}
-    return {"part": "penetration", **labels, **others, **changes}
+    others = {"policy": policy, "fault": "none", "detector": -1}
+    return {"part": "penetration", **labels, **others}
 
 
 def alone(release: str, estimator: str, sensors: str = WHOLE) -> Labels:
@@ -174,15 +148,9 @@ def alone(release: str, estimator: str, sensors: str = WHOLE) -> Labels:
     return sensed(release, estimator, sensors=sensors, policy="none")
 
 
-def miscounting(release: str, estimator: str) -> list[Labels]:
-    """Return the labels of each detector in turn that counts too many, and too few."""
-    faults = product(FACTORS, range(len(DETECTORS)))
-    return [sensed(release, estimator, fault=fault, detector=k) for fault, k in faults]
-
-
 def sensed_cell(labels: Labels) -> Cell:
     """Return the cell of `sensed` labels."""
-    fault, sensors = labels["fault"], labels["sensors"]
+    sensors = labels["sensors"]
     keywords: dict[str, Any] = {
         "privacy": labels["release"],
         "epsilon": WHOLE_EPSILON if sensors == WHOLE else EPSILON,
@@ -191,11 +159,6 @@ def sensed_cell(labels: Labels) -> Cell:
         "penetration": {"share": labels["share"]},
         "corridor": {"fixed_sensors": [] if sensors == QUERIES else list(DETECTORS)},
     }
-    if fault in FACTORS:
-        factors = [
-            FACTORS[fault] if k == labels["detector"] else 1.0 for k in range(len(DETECTORS))
-        ]
-        keywords["detectors"] = {"factor": factors}
     if labels["estimator"] == LEARNED:  # its deviations are honest, filters do better without
         keywords["fusion"] = {"dwell_factor": 1.0}
     return Cell(PRIVATE, labels["policy"], keywords, labels, seeds=SENSED_SEEDS)
@@ -207,11 +170,6 @@ SENSED_CELLS = [
         *(sensed(*e) for e in product(RELEASES, ESTIMATORS, SHARES.values(), [BOTH, QUERIES])),
         *(alone(*each) for each in product(RELEASES, ESTIMATORS, [PART])),
         *(alone(*each) for each in product(GUARANTEED, ESTIMATORS)),
-        *(
-            sensed("paced", name, SHARES[share], policy=policy)
-            for name, share, policy in product((EKF, LEARNED), RANKED_SHARES, RANKED[1:])
-        ),
-        *chain(*(miscounting(*pair) for pair in product(FAULTY_RELEASES, ESTIMATORS[:-1]))),
     )
 ]
 
@@ -245,15 +203,11 @@ MOVED_NOTES = f"Error x 1000, traffic seeds {format_range(MOVED_SEEDS)}."
 def world_tables(rows: pl.DataFrame) -> list[str]:
     """Return the tables of the first part."""
 
-    def error(labels: Labels, **changes: Any) -> str:
+    def error(labels: Labels, **changes: str) -> str:
         return tenths(mean(rows, {**labels, **changes}, ERROR))
 
     def gain(labels: Labels) -> str:
         return "-" if labels["estimator"] == EKF else format_interval(below_ekf(rows, labels))
-
-    def network(labels: Labels, **changes: int) -> str:
-        labels = {**labels, **changes}
-        return f"{mean(rows, labels, ERROR).mean:.1f} ({honesty(rows, labels)})"
 
     parts = ["# Every vehicle answers", WORLD_NOTES, "![Errors](fig_estimators.png)"]
     columns: dict[str, Callable[[Any], str]] = {
@@ -264,28 +218,11 @@ def world_tables(rows: pl.DataFrame) -> list[str]:
         "χ²": partial(honesty, rows),
     }
     parts.append(table("", lines_of(WORLDS, EVERYONE, in_world), columns))
-    columns = {f"`{each}`": partial(error, policy=each) for each in (*POLICIES, SHIPPED)}
-    parts += [
-        "## Query policies",
-        "Error x 1000.",
-        table("", lines_of(MAIN, EVERYONE, in_world), columns),
-    ]
     columns = {LABELS[each]: partial(error, estimator=each) for each in MOVED}
     columns |= {"recurrent below EKF [%]": gain, "χ² of recurrent": partial(honesty, rows)}
     moved = {world: in_world(world) for world in ELSEWHERE}
     parts += ["## Away from the training", MOVED_NOTES, "![Gains](fig_elsewhere.png)"]
-    parts.append(table("PrivateHighway-v1 but for", moved, columns))
-    played = rows.filter(part="estimators", estimator=LEARNED)["network"].unique().sort()
-    columns = {str(k): partial(network, network=k) for k in played}
-    worlds = {world: in_world(world) for world in WORLDS}
-    parts += ["## Training seeds of the network", "Error x 1000 (χ²). Only 0 is in the package."]
-    return [*parts, table("", worlds, columns)]
-
-
-def loss(rows: pl.DataFrame, cells: Sequence[Labels], reference: Labels) -> Interval:
-    """Return by how much the mean error of cells lies above that of a reference [%], paired."""
-    own, base = paired(rows, (ERROR, cells), (ERROR, [reference]))
-    return mean_interval(100.0 * (own - base).mean(axis=0) / base.mean())
+    return [*parts, table("PrivateHighway-v1 but for", moved, columns)]
 
 
 SENSED_NOTES = f"""PrivateHighway-v1, detectors on segments {format_range(DETECTORS)}, round robin
@@ -293,9 +230,6 @@ with 5 queries a second, traffic seeds {format_range(SENSED_SEEDS)}. Gains are i
 error that they are compared with, paired, and bold where they are certain. Detectors alone have the
 part of the budget that they have beside queries, or all of it (ε = {WHOLE_EPSILON:.2f} for both, of
 which their part is worth ε = {EPSILON:g}); without a guarantee the two are one."""
-FAULT_NOTES = f"""p = {BASE_SHARE:g}. *Miscounts*: one detector counts a third too many or too few,
-the mean over all cases; errors above those of healthy detectors [%]."""
-
 Pair = tuple[str, str]
 """A release model and an estimator."""
 
@@ -323,24 +257,8 @@ def sensed_tables(rows: pl.DataFrame) -> list[str]:
     parts = ["# A share of the vehicles answers", SENSED_NOTES, "![Errors](fig_arms.png)"]
     parts += [f"## Both or either alone, p = {BASE_SHARE:g}", table("", everyone, columns)]
     columns = {name: partial(of_share, share) for name, share in SHARES.items()}
-    parts += ["## Both below detectors with the whole budget", table("", everyone, columns)]
-
-    def ranked(estimator: str, policy: str, share: str) -> str:
-        own = sensed("paced", estimator, SHARES[share], policy=policy)
-        text = f"{mean(rows, own, ERROR).mean:.1f}"
-        against = {**own, "policy": ROUND_ROBIN}
-        return text if own == against else f"{text}, {gain(own, against)}"
-
-    parts += ["## Query policies", f"`paced`: error x 1000, and below `{ROUND_ROBIN}` [%]."]
-    for each in (EKF, LEARNED):
-        parts.append(grid(LABELS[each], RANKED, RANKED_SHARES, partial(ranked, each)))
-
-    columns = {
-        "healthy, error x 1000": lambda c: error(sensed(*c)),
-        "miscounts": lambda c: tenths(loss(rows, miscounting(*c), sensed(*c))),
-    }
-    faulty = lines_of(FAULTY_RELEASES, ESTIMATORS[:-1], lambda *pair: pair)
-    return [*parts, "## Faulty detectors", FAULT_NOTES, table("", faulty, columns)]
+    title = "## Both below detectors with the whole budget"
+    return [*parts, title, table("", everyone, columns)]
 
 
 # ---- Figures. ----
@@ -402,20 +320,3 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
 
 
 STUDY = Study("estimators", (*WORLD_CELLS, *SENSED_CELLS), SEEDS, report)
-
-
-def study(weights: Sequence[str] = ()) -> Study:
-    """Return the study with weights of other training seeds, numbered from 1 on.
-
-    Args:
-        weights: Each a name or what the files of a pair begin with.
-
-    Raises:
-        ValueError: They are no list of texts.
-    """
-    numbered = enumerate(convert(tuple[str, ...], weights, "weights"), start=1)
-    more = [
-        world_cell(world, LEARNED, network=number, weights=each)
-        for world, (number, each) in product(WORLDS, numbered)
-    ]
-    return dataclasses.replace(STUDY, cells=(*STUDY.cells, *more))
