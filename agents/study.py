@@ -11,9 +11,9 @@ all are there, and taken up again after an interruption.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
-import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +35,9 @@ ROWS, TABLES = "rows.parquet", "tables.md"
 
 PARTS = "rows"
 """Folder below it of the rows of cells, until all are there."""
+
+DIGITS = 24
+"""Hexadecimal digits of the name of a file there."""
 
 OWN = (ROWS, PARTS)
 """Names by which a folder is known to be of a study, which goes on there."""
@@ -182,7 +185,15 @@ def _play_missing(study: Study, cells: Sequence[Cell], place: Place) -> None:
     )
     if folder.is_dir():
         write_table(place.folder / ROWS, read_rows(study.name, place.folder))
-        shutil.rmtree(folder)
+        remove_parts(place.folder)
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove the rows of cells from the folder of a study, and nothing that somebody else put."""
+    for path in _parts(folder):
+        path.unlink()
+    with contextlib.suppress(OSError):  # there is none, or it has something of somebody else
+        (folder / PARTS).rmdir()
 
 
 def _play_cell(
@@ -204,7 +215,12 @@ def _play_cell(
 
 
 def _file_of(folder: Path, cell_id: str) -> Path:
-    return folder / f"{hashlib.sha256(cell_id.encode()).hexdigest()[:24]}.parquet"
+    return folder / f"{hashlib.sha256(cell_id.encode()).hexdigest()[:DIGITS]}.parquet"
+
+
+def _parts(folder: Path) -> list[Path]:
+    """Return the files of `_file_of` in the folder of a study."""
+    return sorted((folder / PARTS).glob(f"{'[0-9a-f]' * DIGITS}.parquet"))
 
 
 def read_rows(study: str, folder: Path) -> pl.DataFrame:
@@ -217,7 +233,7 @@ def read_rows(study: str, folder: Path) -> pl.DataFrame:
     """
     keys = (*ORIGIN, "traffic_seed")
     tables = []
-    for path in (folder / ROWS, *sorted((folder / PARTS).glob("*.parquet"))):
+    for path in (folder / ROWS, *_parts(folder)):
         if path.exists():
             tables.append(read_table(path, keys))
             others = [name for name in tables[-1]["study"].unique() if name != study]

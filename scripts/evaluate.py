@@ -13,7 +13,6 @@ An entry to the query suite gets a card. Of several policies the first that suit
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +30,7 @@ from agents.policies import find_policy, policy_name
 from agents.seeds import seed_kind
 from agents.statistics import Interval, mean_interval
 from agents.studies import suite
-from agents.study import OWN, PARTS, ROWS, TABLES, Place, Study, play_study, write_tables
+from agents.study import OWN, ROWS, TABLES, Place, Study, play_study, remove_parts, write_tables
 from agents.tables import (
     DENSITY,
     ERROR,
@@ -160,7 +159,7 @@ def compare(args: Args) -> None:
     if args.force:
         for name in (ROWS, TABLES, *figures):
             (args.output / name).unlink(missing_ok=True)
-        shutil.rmtree(args.output / PARTS, ignore_errors=True)
+        remove_parts(args.output)
     rows = play("evaluation", cells, seeds, place)
     scores = score(rows, cells, args.reference)
     draw_scores(args.output / ERRORS, title, scores, cells)

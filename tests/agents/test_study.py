@@ -62,6 +62,15 @@ def test_a_study_plays_what_its_rows_lack_and_reports(tmp_path):
     assert calls == [folder]
 
 
+def test_a_study_removes_its_own_files_alone(tmp_path):
+    foreign = tmp_path / "rows" / "thesis.parquet"
+    foreign.parent.mkdir()
+    foreign.write_text("mine")
+    run(small(), Place(tmp_path, this_process))
+    assert [*foreign.parent.iterdir()] == [foreign]
+    assert len(read_rows("small", tmp_path)) == 4
+
+
 def test_rows_of_equal_numbers_count_as_played_and_others_do_not(tmp_path, monkeypatch):
     place, first = Place(tmp_path, this_process), small()
     run(first, place)
