@@ -372,7 +372,7 @@ class FieldSource:
                 table = np.loadtxt(
                     file, ndmin=2, delimiter=self.delimiter, converters=_number_or_nan
                 )
-        except ValueError as problem:
+        except (ValueError, TypeError) as problem:
             by = "blanks" if self.delimiter is None else repr(self.delimiter)
             allowed = f"a table of numbers, with {by} between them, without header and names"
             raise ValueError(f"{path} must be {allowed}: {cut(problem)}") from problem

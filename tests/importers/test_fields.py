@@ -104,6 +104,7 @@ def test_all_windows_may_be_for_tests(tmp_path):
         ({"speed": None}, {}, 100, r"speed must be given, or else flow"),
         ({"density_unit": "cars"}, {}, 100, r"density_unit must be one of veh/km, .*got 'cars'"),
         ({"cell": 0.0}, {}, 100, r"cell must be"),
+        ({"delimiter": ""}, {}, 100, r"density\.txt must be a table of numbers, with '' between"),
         ({}, {}, 450, r"duration must be below the field's 450 s, got 450"),
         ({}, {"segments": 9}, 100, r"segments must be at most 8, on 10 cells of 0\.05 km"),
         (
