@@ -40,6 +40,9 @@ from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
 from dptse_env.utils.validation import integer
 
+MOST_WORKERS = 10_000
+"""Most processes of this machine that may be asked for."""
+
 # Options, one name for one thing in all commands. A command has those that it takes among its
 # bases, and gives them defaults of its own.
 
@@ -190,7 +193,7 @@ class Recording:
             ValueError: A number is out of range, or the folder is none and cannot be made.
         """
         if self.workers is not None:
-            integer("workers", self.workers, 1)
+            integer("workers", self.workers, 1, MOST_WORKERS)
         given = self.records
         if given is not None and not os.path.isdir(given):  # noqa: PTH112 (it may be too long)
             require_writable("records", given)

@@ -68,6 +68,8 @@ HONESTY = ("chi2_density", "chi2_speed")
 ERRORS, MAPS, PAGE, CARD = "errors.png", "space_time.png", "page.html", "card.json"
 """Files of the figures, of the interactive page, and of an entry to the suite."""
 OUTPUT = Path("results/evaluation")
+PLAYED = ("traffic_seeds", "records", "threads", "autoreset_mode", "render_mode")
+"""Keywords of an environment that an evaluation gives, or has no use for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,6 +186,8 @@ def make_cells(args: Args) -> tuple[str, tuple[Cell, ...]]:
         ValueError: A keyword is out of range, or two policies have one name.
     """
     env, given = parse_env(args.env)
+    for key in PLAYED:
+        require(key not in given, f"env.{key}", "left out", given.get(key))
     if args.estimators:  # the environment's own may refuse its road
         given["estimator"] = args.estimators[0]
     config = make_config(env, given)

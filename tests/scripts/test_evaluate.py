@@ -269,6 +269,9 @@ def test_estimators_and_keywords_reach_the_environment():
         (["--policies", "nobody.safetensors"], "nobody.safetensors"),
         (["--policies", "nobody"], "'nobody'"),
         (["--env", f'{SHORT} {{"horizon": 60}}'], "horizon or the road's duration must be above"),
+        (["--env", f'{SHORT} {{"records": "mine"}}'], "env.records must be left out"),
+        (["--env", f'{SHORT} {{"traffic_seeds": "0:2"}}'], "env.traffic_seeds must be left out"),
+        (["--workers", "99999999999999"], "workers must be an integer in 1..10000"),
         (["--beside", "card.json"], "--beside must be left out without --suite"),
     ],
 )
