@@ -22,7 +22,7 @@ import numpy as np
 import polars as pl
 from scipy import stats
 
-from agents.environments import LONG, PAPER, PRIVATE, SHORT, make_config, quietly
+from agents.environments import LONG, PAPER, PRIVATE, SHORT
 from agents.figures import GREY, finish_figure, make_figure, save_figure
 from agents.play import Cell
 from agents.policies import find_policy, policy_name
@@ -45,9 +45,7 @@ from agents.tables import (
     values_of,
 )
 from dptse_env.config import parse_seeds
-from dptse_env.parts import privacy_report
 from dptse_env.policies import shipped_policies
-from dptse_env.privacy import rounded_up
 from dptse_env.utils.validation import number, parse_json, require
 from dptse_env.versions import code_version, numbers_of
 
@@ -441,28 +439,15 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
 
 
 def _cell_table() -> str:
-    def guarantee(each: Cell) -> str:
-        with quietly():
-            found = privacy_report(make_config(each.env, each.keywords))
-        # What is guaranteed is the configured epsilon: that of mu may be a digit off.
-        epsilon = found.epsilon if found.void_reasons else found.claimed_epsilon
-        pair = f"({rounded_up(epsilon, '.4g')}, {rounded_up(found.claimed_delta)})"
-        stated = f"μ = {rounded_up(found.mu, '.2f')}, {pair}"
-        return f"none: {stated}" if found.void_reasons else stated
-
-    header = ["cell", "environment", "traffic seeds", "guarantee"]
-    return markdown(
-        header,
+    lines = [
         [
-            [
-                f"`{name}`",
-                f"`{each.env.rpartition('/')[2]} {json.dumps(each.keywords)}`",
-                format_range(each.seeds or ()),
-                guarantee(each),
-            ]
-            for name, each in CELLS.items()
-        ],
-    )
+            f"`{name}`",
+            f"`{each.env.rpartition('/')[2]} {json.dumps(each.keywords)}`",
+            format_range(each.seeds or ()),
+        ]
+        for name, each in CELLS.items()
+    ]
+    return markdown(["cell", "environment", "traffic seeds"], lines)
 
 
 _LEAST = -0.5
