@@ -2,9 +2,6 @@
 
 python -m benchmarks --parts estimators
 
-python -m benchmarks --env 'dptse_env:dptse/PrivateHighway-v1' \
-    'dptse_env:dptse/PrivateHighway-v1 {"penetration": 0.1}'
-
 Each part runs in a process of its own, and what it compares takes turns there. Nothing else should
 run beside them.
 """
@@ -25,21 +22,18 @@ from benchmarks.turns import HEADER, Row, measure
 from dptse_env.utils.files import write_atomically
 from dptse_env.utils.threads import n_cores
 from dptse_env.versions import versions_with
-from scripts.cli import Command, Environments, run
+from scripts.cli import Command, run
 
 Part = Literal["estimators", "environment", "learning", "long_roads"]
 PACKAGES = ("libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(Environments, Command):
+class Args(Command):
     """Measure and print a table of each part."""
 
     parts: tuple[Part, ...] = get_args(Part)
     """Parts to measure."""
-    env: tuple[str, ...] = ()
-    """Environments to compare with the first of them, in place of all parts: each an id, or an id
-    and keywords as JSON, 'ID {"bandwidth": 3}'."""
     output: Path | None = None
     """Folder of one table of all parts, tables.md; none is written if not given."""
     quick: bool = False
@@ -56,10 +50,10 @@ def main(args: Args) -> None:
     title = f"Python {platform.python_version()}, {n_cores()} cores; {versions}"
     measured: list[Row] = []
     failed: list[str] = []
-    for part in ("environments",) if args.env else args.parts:
+    for part in args.parts:
         try:
             with ProcessPoolExecutor(1, get_context("spawn")) as alone:
-                rows = alone.submit(measure, part, args.env, args.quick).result()
+                rows = alone.submit(measure, part, args.quick).result()
         except Exception:
             traceback.print_exc()
             failed.append(part)

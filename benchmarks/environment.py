@@ -15,12 +15,9 @@ from itertools import count
 from pathlib import Path
 
 import gymnasium as gym
-import numpy as np
 
 from benchmarks.turns import Row, Work, compare, make_batch, repeating, sample, stepping, take_turns
 from dptse_env.config import resolve
-from dptse_env.parts import make_task
-from dptse_env.release.noise import Noise, NoiseSource
 from dptse_env.traffic import Corridor, RecordLibrary, draw_scenario
 from dptse_env.traffic.sumo import running
 from dptse_env.traffic.sumo import seconds as seconds_of
@@ -58,8 +55,6 @@ def measure(*, quick: bool = False) -> list[Row]:
             batch = make_batch(PAPER, n, threads=None, **keywords)
             work[f"{base}, {n_cores()} threads"] = stepping(batch, steps)
         work[f"{base}, PrivateHighway"] = stepping(make_batch(PRIVATE, n, **keywords), steps)
-        for source in ("seeded", "secure"):
-            work[f"{source} noise, {base}, PrivateHighway"] = noise(source, n)
         times = take_turns(work, rounds)
     return compare(times, {name: base for name in times if name != base})
 
@@ -97,13 +92,3 @@ def intersection(duration: int) -> Work:
         env.close()  # one simulation at a time
 
     return turn, duration
-
-
-def noise(source: NoiseSource, n: int) -> Work:
-    """Return work that draws the noise of a second's releases of a batch, and adds it."""
-    task = make_task(resolve("private-highway", {}))
-    shape = n, task.n_channels, 2
-    episodes, values, sigma = np.arange(n), np.zeros(shape), np.full(shape, 5.0)
-    drawn = Noise(n, task.n_channels, source)
-    drawn.reset(episodes, [np.random.default_rng(episode) for episode in range(n)])
-    return lambda: drawn.added(episodes, values, sigma, task.channels.length), n

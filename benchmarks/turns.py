@@ -101,14 +101,7 @@ def stepping(env: SensorQueryVectorEnv, n_steps: int) -> Work:
     return repeating(env, sample(env.action_space, n_steps), env.num_envs)
 
 
-def measure(part: str, envs: Sequence[str], quick: bool) -> list[Row]:
-    """Return the rows of a part, or of environments, of which the first is the others' base.
-
-    It is here, so that a process of its own can be asked for them.
-    """
-    if not envs:
-        rows: list[Row] = importlib.import_module(f"benchmarks.{part}").measure(quick=quick)
-        return rows
-    n, n_steps, rounds = (2, 2, 2) if quick else (256, 20, 25)
-    work = {each: stepping(make_batch(each, n, traffic_seeds="0:16"), n_steps) for each in envs}
-    return compare(take_turns(work, rounds), dict.fromkeys(envs[1:], envs[0]))
+def measure(part: str, quick: bool) -> list[Row]:
+    """Return the rows of a part; a process of its own can be asked for them."""
+    rows: list[Row] = importlib.import_module(f"benchmarks.{part}").measure(quick=quick)
+    return rows

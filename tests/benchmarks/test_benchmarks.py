@@ -1,6 +1,5 @@
 """The benchmarks run and pair the turns of a round; no test depends on speed."""
 
-import json
 import re
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from scipy import stats
 from benchmarks import __main__ as benchmarks
 from benchmarks import long_roads
 from benchmarks.turns import compare, take_turns
-from tests.helpers import ROOT, SHORT
+from tests.helpers import ROOT
 
 
 def run(*words):
@@ -57,7 +56,7 @@ def test_a_ratio_is_a_geometric_mean_with_the_interval_of_the_logarithms():
 
 
 def test_a_part_that_fails_loses_nothing_of_the_others(tmp_path, monkeypatch, capsys):
-    def measure(part, envs, quick):
+    def measure(part, quick):
         return [[f"a step of {part}", "1.0", "", "", ""]] if part != "environment" else {}[part]
 
     monkeypatch.setattr(benchmarks, "measure", measure)
@@ -82,9 +81,3 @@ def test_all_parts_run_and_write_one_table(tmp_path):
     for name in kinds:
         assert name in printed
         assert name in written
-
-
-@pytest.mark.slow
-def test_two_environments_are_compared():
-    other = f"{SHORT} {json.dumps({'bandwidth': 1})}"
-    assert "bandwidth" in run("--env", SHORT, other)
