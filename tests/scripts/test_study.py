@@ -49,6 +49,7 @@ def test_every_study_is_found_and_a_cell_has_one_set_of_labels(name):
         ({"name": f'{__name__}:numbered {{"number": 0}}'}, "must be a Study, got int"),
         ({"name": 'policies {"minutes": 0}'}, r"minutes must be .*, got 0"),
         ({"name": 'policies {"minutes": 1, "seeds": 3}'}, "seeds must be"),
+        ({"name": 'policies {"seeds": "0:2"}'}, "seeds must be left out without minutes"),
         ({"name": MINE, "test_seeds": "all"}, "must be 'first:stop' or one seed, got 'all'"),
         ({"name": MINE, "env": (SHORT,), "report": True}, "env must be left out where nothing"),
         ({"name": MINE, "workers": 0}, "workers must be an integer >= 1"),

@@ -57,7 +57,7 @@ from agents.tables import (
 )
 from dptse_env.config import parse_seeds
 from dptse_env.utils.arrays import FloatArray
-from dptse_env.utils.validation import convert, positive
+from dptse_env.utils.validation import convert, positive, require
 
 Statistic = Callable[..., FloatArray]
 
@@ -514,19 +514,22 @@ STUDY = Study(
 )
 
 
-def study(minutes: float | None = None, seeds: str = "0:5") -> Study:
+def study(minutes: float | None = None, seeds: str | None = None) -> Study:
     """Return the study, which trains what is missing if a time is given.
 
     Args:
         minutes: Time of each training.
-        seeds: Training seeds, first:stop. Every learner has the first, the best two have all.
+        seeds: Training seeds, first:stop, 0:5 if not given. Every learner has the first, the best
+            two have all.
 
     Raises:
-        ValueError: An argument is out of range.
+        ValueError: An argument is out of range, or there are seeds without a time.
     """
     if minutes is None:
+        require(seeds is None, "seeds", "left out without minutes, as nothing is trained", seeds)
         return STUDY
-    time, training_seeds = positive("minutes", minutes), parse_seeds(convert(str, seeds, "seeds"))
+    time = positive("minutes", minutes)
+    training_seeds = parse_seeds(convert(str, "0:5" if seeds is None else seeds, "seeds"))
 
     def follow(rows: pl.DataFrame, place: Place) -> list[Cell]:
         from agents.studies.policies.trainings import train_ladder  # noqa: PLC0415 (needs torch)
