@@ -8,18 +8,21 @@ import io
 import json
 import logging
 import os
+import shutil
 import signal
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TextIO, cast
 
 import tyro
 from rich.table import Table
 from tqdm.contrib.logging import logging_redirect_tqdm
+from tyro.conf import arg
 
 from agents.environments import parse_env, preset_of, quietly
 from agents.executors import Executor, ExecutorError, ExecutorName, make_executor
@@ -181,9 +184,9 @@ class Replacing(Output):
 class Recording:
     """Processes of this machine, and the folder of records. Results depend on neither."""
 
-    workers: int | None = None
+    workers: Annotated[int | None, arg(metavar="INT")] = None
     """Processes on this machine; one for each core if not given."""
-    records: Path | None = None
+    records: Annotated[Path | None, arg(metavar="PATH")] = None
     """Folder of the record cache; the user's if not given."""
 
     def check(self) -> None:
@@ -211,7 +214,7 @@ class Machines(Recording):
 
     executor: ExecutorName = "local"
     """Place of the tasks: this machine, or a Ray cluster."""
-    address: str | None = None
+    address: Annotated[str | None, arg(metavar="STR")] = None
     """Address of the Ray cluster, or auto; see RAY_ADDRESS, too."""
 
     def start_executor(self) -> Executor:
@@ -305,9 +308,9 @@ def parse(
         option = word.partition("=")[0].replace("_", "-")
         if option in renamed:
             raise ValueError(f"{option} is {renamed[option]} now")
-    boxes = io.StringIO()
+    boxes, folded = io.StringIO(), cast(TextIO, _Folded(sys.stdout))
     try:
-        with contextlib.redirect_stderr(boxes):
+        with contextlib.redirect_stdout(folded), contextlib.redirect_stderr(boxes):
             return tyro.cli(
                 arguments, prog=program, args=words, description=description,
                 config=(tyro.conf.FlagCreatePairsOff,),
@@ -316,6 +319,25 @@ def parse(
         if not end.code:
             raise
         raise ValueError(_unboxed(boxes.getvalue())) from None
+
+
+class _Folded:
+    """Standard output of help, whose paragraphs are folded to the width of the terminal."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def write(self, text: str) -> int:
+        width = shutil.get_terminal_size().columns
+        folded = (
+            # What has colours is a table, which fits already.
+            line if len(line) <= width or "\33" in line else textwrap.fill(line, width)
+            for line in text.split("\n")
+        )
+        return self._file.write("\n".join(folded))
 
 
 def _unboxed(box: str) -> str:

@@ -5,8 +5,7 @@ dptse fit my-road.toml
 It records traffic that is missing, fits ARZ parameters by the filter's error on training traffic,
 chooses parameters, estimator and query policy on validation traffic, and plays them once on test
 traffic. The folder my-road-fit gets fit.md, which says what to do next. With --tune it searches
-settings of estimators on training traffic instead, for the road or, without one, for --env, and
-writes a file for the keyword estimator_settings for each. The same command goes on after Ctrl-C.
+settings of estimators instead, of the road or of --env. The same command goes on after Ctrl-C.
 """
 
 from __future__ import annotations

@@ -4,11 +4,10 @@ dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --seed 0 --rounds ow
     --validation-env dptse_env:dptse/ShortHighway-v0 --train-seeds 0:2 --validation-seeds 1000 \
     --plan '{"ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}'
 
-Each kind and seed is a training in a folder of its own. The best weights of each kind on validation
-traffic become weights-flows.safetensors and weights-speeds.safetensors in the output folder, a
-pair that the environment takes with the keywords that the command prints. A folder also has
-progress.csv (the learning curve), plan.json (the settings) and checkpoint.pt. The same command goes
-on from the last checkpoints to the same numbers.
+Each kind and seed is a training in a folder of its own, with progress.csv (the learning curve),
+plan.json (the settings) and checkpoint.pt. The best weights of each kind on validation traffic
+become weights-flows.safetensors and weights-speeds.safetensors in the output folder, a pair that
+the environment takes with the keywords that the command prints. The same command goes on.
 """
 
 from __future__ import annotations

@@ -32,12 +32,12 @@ from tests.scripts.test_import_policy import save_model
 
 KINDS = ["trajectories", "network", "field", "policy"]
 COMMANDS = [*MODULES, *(f"import {kind}" for kind in KINDS)]
-SCREEN = 48
-"""Lines of a screen, of 100 columns."""
+WIDTH, HEIGHT = 100, 48
+"""Columns and lines of a screen."""
 
 
 def help_of(name, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("COLUMNS", str(WIDTH))
     done = run_command(*name.split(), "--help")
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
@@ -48,7 +48,9 @@ def test_help_begins_with_an_example_and_fits_a_screen(name, monkeypatch):
     page = help_of(name, monkeypatch)
     head = page.partition("╭")[0]
     assert re.search(rf"^dptse {name}\b", head, re.MULTILINE)
-    assert len(page.splitlines()) <= SCREEN
+    lines = page.splitlines()
+    assert len(lines) <= HEIGHT
+    assert max(map(len, lines)) <= WIDTH
 
 
 def write_data(folder):
