@@ -12,11 +12,9 @@ the environment takes with the keywords that the command prints. The same comman
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
-import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -33,11 +31,10 @@ from agents.filters.scenarios import Kind, ScenarioRanges
 from agents.filters.training import WEIGHTS, FilterTraining
 from agents.play import record
 from agents.terminal import make_table
-from agents.training.run_files import PROGRESS, Row, read_progress
+from agents.training.run_files import Row
 from dptse_env.config import parse_seeds
 from dptse_env.estimators.recurrent import member_for, read_weights
 from dptse_env.utils.files import replacing, require_output
-from dptse_env.utils.progress import make_bar
 from dptse_env.utils.validation import from_mapping, parse_json, require, within
 from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, ValidationSeeds
 
@@ -45,8 +42,6 @@ NAME = "weights"
 """Name of the pair of weights in the output folder."""
 CONTINUED: dict[str, Any] = {"learning_rate": 1.5e-3, "teacher": 0.5}
 """Fields of a plan that begins with trained weights."""
-GLANCE = 5.0
-"""Time between two looks at the learning curves [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,12 +134,11 @@ def main(args: Args) -> None:
     require_output(args.output, [f"{NAME}-{kind}.safetensors" for kind in plans], own=own)
     executor = args.start_executor()
     record_all(args, plans.values(), executor)
-    with followed(tasks):
-        if len(tasks) == 1:  # the workers then play its scenarios
-            last = [train(tasks[0], args.records, executor)]
-        else:
-            work = partial(train, records=args.records)
-            last = run_in_order(executor, work, tasks, progress=False)
+    if len(tasks) == 1:  # the workers then play its scenarios
+        last = [train(tasks[0], args.records, executor)]
+    else:
+        work = partial(train, records=args.records)
+        last = run_in_order(executor, work, tasks, desc="trainings", unit="training")
     columns = ("validation", "sections", "chi2")
     trainings = {
         folder.name: {name: row[name] for name in columns if name in row}
@@ -193,28 +187,3 @@ def record_all(args: Args, plans: Iterable[FilterPlan], executor: Executor) -> N
 def record_highway(number: int, records: Path | None) -> None:
     """Record a highway if it is missing."""
     record(draw_highway(number), [0], records, workers=1)
-
-
-@contextlib.contextmanager
-def followed(tasks: Sequence[Task]) -> Iterator[None]:
-    """Show a progress bar of all passes, by the learning curves that trainings write."""
-    done = threading.Event()
-
-    def look() -> None:
-        while True:
-            rows = [read_progress(f) for _, f in tasks if (f / PROGRESS).exists()]
-            found = [row["validation"] for each in rows for row in each if "validation" in row]
-            bar.set_postfix(best=f"{1000 * min(found, default=0.0):.1f}" if found else "")
-            bar.update(sum(map(len, rows)) - bar.n)
-            if done.wait(GLANCE):
-                return
-
-    total = sum(plan.n_passes for plan, _ in tasks)
-    with make_bar(total, desc="training", unit="pass") as bar:
-        thread = threading.Thread(target=look, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            done.set()
-            thread.join()

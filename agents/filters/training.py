@@ -24,6 +24,7 @@ from dptse_env.estimators.recurrent_kernels import LONGEST_AGE
 from dptse_env.importers.folder import ROAD, new_folder
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import FloatArray
+from dptse_env.utils.progress import make_bar
 
 WEIGHTS, PLAYED = "weights.safetensors", "played.safetensors"
 """The trained weights, and those that the scenarios of a round are collected with."""
@@ -38,8 +39,6 @@ LARGEST_NORM = 1.0
 AVERAGING = 0.998
 """Decay of the moving average of weights in an update. Batches differ so much that the last weights
 are biased towards the last batches: densities were 4 to 11 veh/km too large."""
-SHOWN_EVERY = 10
-"""Passes after which the learning curve is written."""
 
 
 class State(NamedTuple):
@@ -116,14 +115,18 @@ class FilterTraining(TrainingFolder):
 
     def run(self) -> None:
         """Train to the end of the plan, and save the weights beside the checkpoint."""
-        last = 0
-        for index, each in enumerate(self.plan.rounds):
-            first, last = last, last + each.passes
-            if self.done == first:
-                self._save(PLAYED)
-            collected = self._collect(index) if self.done < last else []
-            while self.done < last:
-                self._pass(index, collected)
+        last, n = 0, self.plan.n_passes
+        with make_bar(n, desc="training", unit="pass", initial=self.done) as bar:
+            for index, each in enumerate(self.plan.rounds):
+                first, last = last, last + each.passes
+                if self.done == first:
+                    self._save(PLAYED)
+                collected = self._collect(index) if self.done < last else []
+                while self.done < last:
+                    row = self._pass(index, collected)
+                    bar.update()
+                    if "validation" in row:
+                        bar.set_postfix_str(f"error {1000 * row['validation']:.1f}")
         self._save(WEIGHTS)
         self.write_curve()
 
@@ -133,8 +136,8 @@ class FilterTraining(TrainingFolder):
         work = partial(collect, estimator=estimator, records=self._records)
         return run_in_order(self._executor, work, self.plan.scenarios(index), progress=False)
 
-    def _pass(self, index: int, collected: Sequence[Episodes]) -> None:
-        """Pass over some episodes, drawn from all scenarios."""
+    def _pass(self, index: int, collected: Sequence[Episodes]) -> Row:
+        """Pass over some episodes, drawn from all scenarios; return the row of the curve."""
         started = time.perf_counter()
         plan, rate = self.plan, self.plan.rate(self.done)
         for group in self._optimiser.param_groups:
@@ -168,8 +171,7 @@ class FilterTraining(TrainingFolder):
                 done=self.done,
                 seconds=self._seconds,
             )
-        elif self.done % SHOWN_EVERY == 0 and self.done > plan.checkpoint_every:
-            self.write_curve()
+        return row
 
     def _window(
         self, batch: Batch, taught: Batch | None, window: range, states: list[State]
