@@ -69,7 +69,7 @@ RULES = (
     "largest-deviation", "speed-front", "expected-reduction",
 )  # fmt: skip
 """Policies that need no training; "shift-ahead" is the paper's schedule."""
-PLACKETT_LUCE, STARTED = "plackett-luce", "ppo-from-plackett-luce"
+PLACKETT_LUCE = "plackett-luce"
 LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "ppo-perceptron": ("ppo", {"policy": "mlp"}),
     "ppo-road": ("ppo", {}),
@@ -77,10 +77,10 @@ LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "recurrent-ppo": ("recurrent-ppo", {}),
     "qr-dqn": ("qr-dqn", {}),
     PLACKETT_LUCE: (PLACKETT_LUCE, {}),
-    STARTED: ("ppo", {}),
 }
-"""Algorithms of ``dptse train``, with what differs from their tuned settings. `STARTED` has half of
-its time for Plackett-Luce, from whose best policy PPO starts."""
+"""Algorithms of ``dptse train``, with what differs from their tuned settings."""
+SHOWN = (*LEARNERS, "ppo-from-plackett-luce")
+"""Learners of the figures. The last one is recorded, and trained no more."""
 VALIDATION, TEST = "validation", "test"
 """Parts of the study, in the column ``part`` of its rows."""
 
@@ -367,7 +367,7 @@ def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
             continue
         for rule, error in shown.items():
             draw_rule(axis, rule, error)
-        for learner, colour in zip(LEARNERS, COLOURS, strict=False):
+        for learner, colour in zip(SHOWN, COLOURS, strict=True):
             own = curves.filter(setting=name, policy=learner).sort("training_seed", "seconds")
             for _, each in own.group_by("training_seed", maintain_order=True):
                 minutes = each["seconds"] / 60.0
@@ -383,7 +383,7 @@ def draw_below(rows: pl.DataFrame, path: Path) -> None:
     figure, axes = _panels((each.description for each in SETTINGS.values()), sharey=True)
     for axis, name in zip(axes, SETTINGS, strict=True):
         looks = {
-            **dict.fromkeys(LEARNERS, (COLOURS[0], "learners, a minute")),
+            **dict.fromkeys(SHOWN, (COLOURS[0], "learners, a minute")),
             SHIPPED.get(name, ""): (COLOURS[1], "policies of the package, nine minutes"),
             **dict.fromkeys((ORACLE, GAIN), (GREY, "oracles")),
         }
@@ -394,7 +394,7 @@ def draw_below(rows: pl.DataFrame, path: Path) -> None:
                 continue
         axis.axvline(0.0, color=GREY, linewidth=0.8)
         axis.margins(x=0.2)
-        labels = (*LEARNERS, "package", ORACLE, GAIN)
+        labels = (*SHOWN, "package", ORACLE, GAIN)
         axis.set_yticks([-place for place in range(len(labels))], labels)
         axis.set_xlabel("below the best rule [%]", fontsize=8)
     title = "Errors below the best rule's; 95 % intervals"

@@ -14,9 +14,7 @@ from agents.play import Cell, record
 from agents.studies.policies import (
     CURVES,
     LEARNERS,
-    PLACKETT_LUCE,
     SETTINGS,
-    STARTED,
     ranked_learners,
     read_curves,
     training_folder,
@@ -33,9 +31,6 @@ from dptse_env.policies import read_policy
 BEST_LEARNERS = 2
 """Learners of each setting that are trained with every training seed."""
 
-START = "start"
-"""Folder, beside those of learners, of the Plackett-Luce trainings that `STARTED` starts from."""
-
 
 class Training(NamedTuple):
     """A training of the study."""
@@ -43,11 +38,6 @@ class Training(NamedTuple):
     setting: str
     learner: str
     seed: int
-
-    @property
-    def start(self) -> Training:
-        """The training that it starts from, if it is one of `STARTED`."""
-        return self._replace(learner=START)
 
     def folder(self, study: Path) -> Path:
         """Return its folder in that of the study."""
@@ -100,70 +90,46 @@ def fits(setting: str, learner: str) -> bool:
     return parse_algorithm(LEARNERS[learner][0], config.corridor.geometry.n_mainline).fits(config)
 
 
-def plan_of(training: Training, study: Path, minutes: float) -> TrainingPlan:
-    """Return the plan of a training.
-
-    Args:
-        training: The training. What it starts from is finished.
-        study: Folder of the study.
-        minutes: Time of the training with what it starts from.
-    """
-    setting, learner = SETTINGS[training.setting], training.learner
-    name, own = LEARNERS[PLACKETT_LUCE if learner == START else learner]
-    if learner in (START, STARTED):
-        minutes /= 2
+def plan_of(training: Training, minutes: float) -> TrainingPlan:
+    """Return the plan of a training of some minutes."""
+    setting, (name, own) = SETTINGS[training.setting], LEARNERS[training.learner]
     n_segments = config_of(training.setting).corridor.geometry.n_mainline
     given = {**setting.changes.get(name, {}), **own}
-    algorithm = parse_algorithm(f"{name} {json.dumps(given)}", n_segments)
     return TrainingPlan(
         (f"{setting.env} {json.dumps(setting.keywords)}",),
-        algorithm,
+        parse_algorithm(f"{name} {json.dumps(given)}", n_segments),
         training.seed,
         setting.traffic.training,
         setting.traffic.validation,
         minutes,
-        initial=str(training.start.folder(study) / BEST) if learner == STARTED else None,
     )
 
 
 def _train_missing(trainings: Sequence[Training], place: Place, minutes: float) -> None:
     study = place.folder.absolute()
-    for stage in ([each.start for each in trainings if each.learner == STARTED], trainings):
-        plans = {each.folder(study): plan_of(each, study, minutes) for each in stage}
-        for folder, plan in plans.items():
-            check_plan(folder, plan.content())
-        # A training that has come to its end has drawn its curve.
-        missing = {folder: plan for folder, plan in plans.items() if not (folder / CURVE).exists()}
-        train_all(missing, place.executor, records=place.records)
+    plans = {each.folder(study): plan_of(each, minutes) for each in trainings}
+    for folder, plan in plans.items():
+        check_plan(folder, plan.content())
+    # A training that has come to its end has drawn its curve.
+    missing = {folder: plan for folder, plan in plans.items() if not (folder / CURVE).exists()}
+    train_all(missing, place.executor, records=place.records)
     keep_curves(study)
 
 
 def keep_curves(study: Path) -> None:
-    """Write the learning curves of the trainings that are finished.
-
-    Steps and time of what a training starts from count, too.
-    """
+    """Write the learning curves of the trainings that are finished."""
     parts = []
     for curve in sorted(study.glob(f"trainings/*/*/*/{CURVE}")):
         setting, learner, seed = curve.parts[-4:-1]
-        training = Training(setting, learner, int(seed))
-        if learner not in LEARNERS:
-            continue
-        starts = [training.start] if learner == STARTED else []
-        earlier = [read_progress(each.folder(study))[-1] for each in starts]
+        origin = {
+            "setting": setting,
+            "policy": learner,
+            "training_seed": int(seed),
+            "digest": read_policy(curve.with_name(BEST)).identity,
+        }
+        measured = ("steps", "seconds", "validation", "validation_drawn")
         parts += [
-            {
-                "setting": setting,
-                "policy": learner,
-                "training_seed": training.seed,
-                "digest": read_policy(training.folder(study) / BEST).identity,
-                **{
-                    name: row[name] + sum(last[name] for last in earlier)
-                    for name in ("steps", "seconds")
-                },
-                **{name: row[name] for name in ("validation", "validation_drawn")},
-            }
-            for row in read_progress(training.folder(study))
+            origin | {name: row[name] for name in measured} for row in read_progress(curve.parent)
         ]
     if parts:
         write_table(study / CURVES, pl.DataFrame(parts))

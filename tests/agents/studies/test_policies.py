@@ -10,8 +10,8 @@ import pytest
 from agents.executors import this_process
 from agents.statistics import bootstrap, percent_below
 from agents.studies import policies
-from agents.studies.policies import GAIN, ORACLE, ROUND_ROBIN, RULES, STARTED, TEST, VALIDATION
-from agents.studies.policies.trainings import START, Training, fits, plan_of, train_ladder
+from agents.studies.policies import GAIN, ORACLE, ROUND_ROBIN, RULES, TEST, VALIDATION
+from agents.studies.policies.trainings import Training, fits, plan_of, train_ladder
 from agents.study import Place, read_rows, read_table, run, write_report, write_table
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.policies import read_policy, shipped_policies
@@ -191,20 +191,18 @@ def test_rows_of_a_policy_that_was_shipped_before_are_left_out(ladder, errors):
 
 def test_every_learner_has_a_plan_in_the_settings_that_it_fits():
     pairs = [pair for pair in product(policies.SETTINGS, policies.LEARNERS) if fits(*pair)]
-    assert len(pairs) == 7 * 7 - 4
+    assert len(pairs) == 7 * 6 - 4
     assert [name for name, learner in pairs if learner == "qr-dqn"] == [
         "short", "short-paced", "private-1",
     ]  # fmt: skip
     for setting, learner in pairs:
-        if learner != STARTED:
-            assert plan_of(Training(setting, learner, 0), Path(), 10.0).worlds
+        assert plan_of(Training(setting, learner, 0), 10.0).worlds
 
 
-def test_what_a_training_starts_from_has_half_of_its_time():
-    whole = plan_of(Training("long", "plackett-luce", 3), Path(), 10.0)
-    assert (whole.seed, whole.minutes, whole.algorithm.n_envs) == (3, 10.0, 16)
-    assert plan_of(Training("long", START, 3), Path(), 10.0).minutes == 5.0
-    assert plan_of(Training("long", "ppo-road", 0), Path(), 10.0).algorithm.validations == 2
+def test_a_plan_has_the_settings_of_its_road():
+    plan = plan_of(Training("long", "plackett-luce", 3), 10.0)
+    assert (plan.seed, plan.minutes, plan.algorithm.n_envs) == (3, 10.0, 16)
+    assert plan_of(Training("long", "ppo-road", 0), 10.0).algorithm.validations == 2
 
 
 @pytest.mark.slow
@@ -216,7 +214,6 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
         "ppo-perceptron": ("ppo", {**SMALL["ppo"], "policy": "mlp"}),
         "qr-dqn": ("qr-dqn", SMALL["qr-dqn"]),
         "plackett-luce": ("plackett-luce", SMALL["plackett-luce"]),
-        STARTED: ("ppo", {k: v for k, v in SMALL["ppo"].items() if k != "hidden"}),
     }
     for module in (policies, policies.trainings):
         monkeypatch.setattr(module, "LEARNERS", learners)
@@ -236,12 +233,11 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
     assert kept.stat().st_mtime_ns == before
     curves = read_table(tmp_path / policies.CURVES)
     seeds = curves.group_by("policy").agg(pl.col("training_seed").n_unique())
-    assert sorted(seeds["training_seed"]) == [1, 1, 2, 2]
-    started = curves.filter(policy=STARTED, training_seed=0)
-    assert started["seconds"].min() > 0.0
+    assert sorted(seeds["training_seed"]) == [1, 2, 2]
+    assert curves["seconds"].min() > 0.0
     rows = read_rows("policies", tmp_path).filter(part=TEST)
-    assert rows["cell"].n_unique() == 2 + 2 + 6
+    assert rows["cell"].n_unique() == 2 + 2 + 5
     assert rows.filter(policy=GAIN)["traffic_seed"].n_unique() == 2
     assert "| plackett-luce |" in (tmp_path / "tables.md").read_text("utf-8")
-    with pytest.raises(ValueError, match=r"another plan: minutes is 0\.025 there and 0\.05 now"):
+    with pytest.raises(ValueError, match=r"another plan: minutes is 0\.05 there and 0\.1 now"):
         train_ladder(place, 0.1, (0,))
