@@ -30,7 +30,7 @@ GROUPS = {
 """Commands by what a person wants. Each is a module of this folder with ``Args`` and ``main``."""
 
 ANEW = ("audit", "import", "info")
-"""Commands that begin anew after an interruption, as others do with --force."""
+"""Commands that begin anew after an interruption, as evaluate does with --force."""
 
 GONE = {
     "suite": "evaluate --suite",
@@ -64,6 +64,7 @@ RENAMED: dict[str, dict[str, str]] = {
     "info": {"--mu": "dptse_env.privacy.over_trips, a function,"},
     "record": {"--seeds": "--train-seeds, --validation-seeds or --test-seeds"},
     "study": {
+        "--quick": "--test-seeds 2000:2003",
         "--seeds": "--test-seeds",
         "--train": """part of the name, 'policies {"minutes": 1}'""",
         "--training-seeds": """part of the name, 'policies {"minutes": 1, "seeds": "0:5"}'""",
@@ -100,7 +101,9 @@ def main(words: Sequence[str]) -> None:
         from scripts.cli import run  # noqa: PLC0415  (slow to import)
 
         module = importlib.import_module(MODULES[name])
-        program, resumes = f"dptse {name}", name not in ANEW and "--force" not in rest
+        program = f"dptse {name}"
+        # A search of settings goes on with its trials all the same.
+        resumes = name not in ANEW and (name == "fit" or "--force" not in rest)
         run(
             module.main, module.Args, module.__doc__, program=program, words=rest,
             renamed=RENAMED[name], resumes=resumes,

@@ -36,7 +36,6 @@ STUDIES = {
     "suite": "agents.studies.suite:STUDY",
 }
 RESULTS = Path("results")
-QUICK_SEEDS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,16 +48,14 @@ class Args(Command, Machines, TestSeeds, Environments):
     seeds first, 'roads {"weights": ["my-weights"]}' plays weights of your own."""
     report: bool = False
     """Write tables and figures of the rows that are there, and play nothing."""
-    quick: bool = False
-    """Three traffic seeds for each cell, to see whether it runs."""
     env: tuple[str, ...] = ()
     """Environments, 'ID {"corridor": "my-road.toml"}': only cells of these ids are played, and
     with these keywords."""
     test_seeds: str | None = None
     """Test traffic seeds, first:stop, in place of the study's own."""
     output: Path | None = None
-    """Folder of the results; results/NAME if not given, with "-quick" for quick ones. Other
-    environments, seeds or keywords need one of their own."""
+    """Folder of the results; results/NAME if not given. Other environments, seeds or keywords
+    need one of their own."""
 
 
 def parse_study(text: str) -> Study:
@@ -101,7 +98,6 @@ def find_study(args: Args) -> Study:
     given = {env.rpartition(":")[2]: keywords for env, keywords in map(parse_env, args.env)}
     require(len(given) == len(args.env), "env", "of different ids", args.env)
     others = args.test_seeds and parse_seeds(args.test_seeds, "test_seeds")
-    most = QUICK_SEEDS if args.quick else None
 
     def changed(cells: Sequence[Cell]) -> list[Cell]:
         taken = []
@@ -113,7 +109,7 @@ def find_study(args: Args) -> Study:
                 if own is not None and others and seed_kind(own) != "validation":
                     own = None
                 keywords = {**cell.keywords, **more}
-                taken.append(dataclasses.replace(cell, keywords=keywords, seeds=own and own[:most]))
+                taken.append(dataclasses.replace(cell, keywords=keywords, seeds=own))
         return taken
 
     cells, follow = changed(found.cells), found.follow
@@ -131,7 +127,7 @@ def find_study(args: Args) -> Study:
     return dataclasses.replace(
         found,
         cells=tuple(cells),
-        seeds=(others or found.seeds)[:most],
+        seeds=others or found.seeds,
         follow=follow and (lambda rows, place: changed(follow(rows, place))),
         # Further tables are measured in the study's own environments.
         measures={} if given else found.measures,
@@ -161,7 +157,7 @@ def _suitable(cells: Sequence[Cell]) -> tuple[list[Cell], list[ValueError]]:
 def main(args: Args) -> None:
     """Play what is missing, and report."""
     study = find_study(args)
-    folder = args.output or RESULTS / f"{study.name}{'-quick' if args.quick else ''}"
+    folder = args.output or RESULTS / study.name
     _, _, keywords = args.name.partition(" ")
     for name, given in (("test_seeds", args.test_seeds), ("env", args.env), ("name", keywords)):
         allowed = "given with an output of its own, since the rows are others"

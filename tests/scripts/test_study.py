@@ -7,6 +7,7 @@ import pytest
 
 from agents.executors import this_process
 from agents.study import Place, read_rows
+from dptse_env.config import VALIDATION_SEEDS
 from examples.my_study import STUDY
 from scripts.study import STUDIES, Args, find_study, main
 from tests.scripts.commands import run_command
@@ -29,8 +30,6 @@ def test_every_study_is_found_and_a_cell_has_one_set_of_labels(name):
     assert study.name == name
     labels = {cell.id: cell.labels for cell in study.cells}
     assert all(cell.labels == labels[cell.id] for cell in study.cells)
-    quick = find_study(Args(name=name, quick=True))
-    assert max(len(quick.seeds_of(cell)) for cell in quick.cells) == 3
 
 
 @pytest.mark.parametrize(
@@ -95,10 +94,11 @@ def test_seeds_and_environments_can_be_others_with_an_output_of_their_own():
 
 
 def test_choices_keep_their_validation_traffic_on_other_seeds(tmp_path):
-    study = find_study(Args(name="policies", test_seeds="2900:2902", quick=True))
+    study = find_study(Args(name="policies", test_seeds="2900:2902"))
     cells = [*study.cells, *study.follow(pl.DataFrame(), Place(tmp_path, this_process))]
     seeds = {cell.labels["part"]: study.seeds_of(cell) for cell in cells}
-    assert seeds == {"validation": (1000, 1001, 1002), "test": (2900, 2901)}
+    assert seeds["test"] == (2900, 2901)
+    assert set(seeds["validation"]) <= set(VALIDATION_SEEDS)
 
 
 @pytest.mark.slow

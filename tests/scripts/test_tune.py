@@ -71,6 +71,15 @@ def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
     assert content["provenance"]["n_trials"] == finished(journal) == 16
 
 
+def test_a_search_goes_on_after_ctrl_c_with_force_too(monkeypatch):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("scripts.fit.main", interrupt)
+    said = run_command(*TUNE, "--env", SHORT, "--force").stderr
+    assert "the same command goes on from what is done" in said
+
+
 def finished(journal):
     """Count trials that were completed or stopped early."""
     backend = optuna.storages.journal.JournalFileBackend(str(journal))
