@@ -17,7 +17,7 @@ from agents.files import write_json
 from dptse_env.utils.files import require_output
 from dptse_env.utils.validation import inside, integer, positive, require
 from dptse_env.versions import versions_with
-from scripts.cli import Command, Environment, Machines, Policies, Replacing, Seed
+from scripts.cli import Command, Environment, Machines, Policies, Replacing, Seed, require_open
 
 RESULT = "audit.json"
 
@@ -54,6 +54,7 @@ def main(args: Args) -> None:
     inside("confidence", args.confidence, 0.0, 1.0)
     require(len(args.policies) == 1, "policies", "one policy", args.policies)
     env, keywords = parse_env(args.env)
+    require_open(keywords)
     with quietly():
         make_vector(env, 1, keywords).process  # noqa: B018 (an estimator may refuse the road)
     config = make_config(env, keywords)

@@ -41,7 +41,7 @@ from dptse_env.utils import progress
 from dptse_env.utils.files import require_writable
 from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
-from dptse_env.utils.validation import integer
+from dptse_env.utils.validation import integer, require
 
 MOST_WORKERS = 10_000
 """Most processes of this machine that may be asked for."""
@@ -231,6 +231,20 @@ class Machines(Recording):
     def place(self, folder: Path) -> Place:
         """Return a folder with the executor that works for it."""
         return Place(folder, self.start_executor(), self.records)
+
+
+GIVEN = ("traffic_seeds", "records", "threads", "autoreset_mode", "render_mode")
+"""Keywords of an environment that a command that plays it gives, or has no use for."""
+
+
+def require_open(keywords: Mapping[str, Any]) -> None:
+    """Refuse keywords in ``--env`` that would be ignored.
+
+    Raises:
+        ValueError: There is one.
+    """
+    for key in GIVEN:
+        require(key not in keywords, f"env.{key}", "left out", keywords.get(key))
 
 
 BAD_INPUT = (

@@ -58,6 +58,7 @@ from scripts.cli import (
     Replacing,
     Seed,
     TestSeeds,
+    require_open,
 )
 
 ALL = "all"
@@ -68,8 +69,6 @@ HONESTY = ("chi2_density", "chi2_speed")
 ERRORS, MAPS, PAGE, CARD = "errors.png", "space_time.png", "page.html", "card.json"
 """Files of the figures, of the interactive page, and of an entry to the suite."""
 OUTPUT = Path("results/evaluation")
-PLAYED = ("traffic_seeds", "records", "threads", "autoreset_mode", "render_mode")
-"""Keywords of an environment that an evaluation gives, or has no use for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,8 +185,7 @@ def make_cells(args: Args) -> tuple[str, tuple[Cell, ...]]:
         ValueError: A keyword is out of range, or two policies have one name.
     """
     env, given = parse_env(args.env)
-    for key in PLAYED:
-        require(key not in given, f"env.{key}", "left out", given.get(key))
+    require_open(given)
     if args.estimators:  # the environment's own may refuse its road
         given["estimator"] = args.estimators[0]
     config = make_config(env, given)
@@ -196,7 +194,7 @@ def make_cells(args: Args) -> tuple[str, tuple[Cell, ...]]:
         name = policy_name(source)
         require(policies.setdefault(name, source) == source, "policies", "of different names", name)
     cells = []
-    for estimator in args.estimators or (str(config.estimator),):
+    for estimator in dict.fromkeys(args.estimators or (str(config.estimator),)):
         own = {**given, "estimator": estimator} if args.estimators else given
         for name, policy in policies.items():
             more = {"bandwidth": config.corridor.geometry.n_mainline} if policy == ALL else {}

@@ -27,7 +27,15 @@ from agents.training.settings import PlackettLuceSettings, parse_algorithm
 from agents.training.training import train, train_all
 from dptse_env.config import parse_seeds
 from dptse_env.utils.validation import integer, read_json
-from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, ValidationSeeds
+from scripts.cli import (
+    MOST_WORKERS,
+    Command,
+    Environments,
+    Machines,
+    Output,
+    TrainSeeds,
+    ValidationSeeds,
+)
 
 MINUTES = 10.0
 """Time of a training where nothing else is given, but for plackett-luce."""
@@ -87,7 +95,7 @@ def make_plans(args: Args) -> dict[Path, TrainingPlan]:
 
 def main(args: Args) -> None:
     """Record missing traffic, train, and print the errors of the best policies in validation."""
-    torch.set_num_threads(integer("threads", args.threads, 1))
+    torch.set_num_threads(integer("threads", args.threads, 1, MOST_WORKERS))
     plans = make_plans(args)
     plan = next(iter(plans.values()))
     plan.check()

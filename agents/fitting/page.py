@@ -66,7 +66,7 @@ def write_page(
         f"of test traffic, which was played once. {intervals} χ² is the mean square of errors over "
         "reported deviations: 1 is honest.",
         "## Bandwidth and epsilon",
-        f"Error x 1000 of what was chosen, on the first {min(n, SEEDS)} episodes:",
+        f"Error x 1000 of what was chosen, on {min(n, SEEDS)} of {n} episodes:",
         budget_table(budgets),
         advice(budgets, road.config.privacy.epsilon),
         "## What was compared",

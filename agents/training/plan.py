@@ -106,7 +106,7 @@ class TrainingPlan:
             saved = read_policy(self.initial).card["policy"]["class"]
             require(saved == RoadPolicy.__name__, "initial", "a saved RoadPolicy", saved)
         for _, keywords in map(parse_env, self.envs):
-            for key in ("action", "traffic_seeds", "autoreset_mode"):
+            for key in ("action", "traffic_seeds", "records", "autoreset_mode"):
                 if key in keywords:
                     raise ValueError(f"env: {key} is chosen by the training, leave it out")
 

@@ -19,6 +19,7 @@ from dptse_env.importers.folder import (
     moved,
     named_after,
     new_folder,
+    require_new,
 )
 from dptse_env.importers.measured import with_measured
 from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
@@ -29,7 +30,6 @@ from dptse_env.traffic.imported import ranges, save_records
 from dptse_env.traffic.record import Record
 from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
-from dptse_env.utils.files import require_output
 from dptse_env.utils.units import HOUR
 from dptse_env.utils.validation import (
     Interval,
@@ -499,7 +499,7 @@ def import_field(
     integer("duration", duration, 1)
     integer("segments", road.segments, 2)
     name = named_after(output)
-    require_output(output.parent, [output.name])
+    require_new(output)
     density, flow = source.read(road.lanes, road.speed_limit)
     each = source.cells_of(road.segments, len(density))
     field = np.stack(by_second(density, flow, road.segments + 2, source.interval), axis=-1)

@@ -164,6 +164,16 @@ def named_after(output: Path) -> str:
     return name
 
 
+def require_new(output: Path) -> None:
+    """Refuse a folder that is there, or cannot be made.
+
+    Raises:
+        ValueError: It is so.
+    """
+    require(output.name != "", "output", "a folder with a name", str(output))
+    require_output(output.parent, [output.name])
+
+
 def moved(road: Corridor, output: Path) -> Corridor:
     """Return a road whose recordings are in another folder."""
     assert road.recordings is not None
@@ -223,7 +233,7 @@ def new_folder(output: Path) -> Iterator[Path]:
         ValueError: There is something at `output`, or it cannot be written.
         OSError: The disk is full.
     """
-    require_output(output.parent, [output.name])
+    require_new(output)
     output.parent.mkdir(parents=True, exist_ok=True)
     work = hidden(output.absolute())
     for left in left_hidden(output):

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -397,6 +398,8 @@ def test_a_field_that_is_too_short_may_be_transposed(tmp_path):
 
 
 def test_a_folder_is_never_replaced(tmp_path):
+    with pytest.raises(ValueError, match=r"output must be a folder with a name, got '\.'"):
+        import_field(write(tmp_path), ROAD, Path(), SPLITS, 100)
     import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)
     with pytest.raises(ValueError, match=r"output must not exist yet"):
         import_field(write(tmp_path), ROAD, tmp_path / "road", SPLITS, 100)

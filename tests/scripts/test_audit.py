@@ -131,6 +131,7 @@ def test_every_argument_arrives(tmp_path, capsys):
         ({"policies": ("random",)}, "policies"),
         ({"policies": ("hunter", "static")}, "policies"),
         ({"trials": 1}, "trials"),
+        ({"env": f'{SHORT} {{"records": "mine"}}'}, r"env\.records"),
         ({"noise_factor": 0.0}, "noise_factor"),
         ({"confidence": 1.0}, "confidence"),
         ({"one_run": True, "trials": 5000, "target": "deleted"}, "--target"),

@@ -241,7 +241,7 @@ def test_an_estimator_may_claim_to_be_exact(tmp_path):
 
 def test_estimators_and_keywords_reach_the_environment():
     env = f'{SHORT} {{"privacy": {{"preset": "capped", "cap": 9}}, "bandwidth": 1}}'
-    args = Args(env=env, policies=("random", "all"), estimators=("ukf", "ekf"))
+    args = Args(env=env, policies=("random", "all"), estimators=("ukf", "ekf", "ukf"))
     title, cells = make_cells(args)
     assert "privacy.cap 9, bandwidth 1" in title
     keywords = [cell.keywords for cell in cells]

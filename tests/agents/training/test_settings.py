@@ -94,6 +94,7 @@ def env(**keywords):
         ({"validation_seeds": (0,)}, r"validation_seeds must be .* 1000\.\.1999, got 0"),
         ({"envs": ()}, r"env must be one or more environments, got \(\)"),
         ({"envs": env(action="mask")}, "env: action is chosen by the training"),
+        ({"envs": env(records="mine")}, "env: records is chosen by the training"),
         ({"envs": (f"{SHORT} 3",)}, "env must be an id and a JSON object, got"),
         ({"envs": env(estimatr="ukf")}, "estimatr is unknown"),
         ({"envs": env(horizon=60)}, "horizon or the road's duration must be above the 60 s"),
