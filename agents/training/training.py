@@ -161,22 +161,14 @@ def train_all(
     tasks = [(plan, folder.absolute()) for folder, plan in plans.items()]
 
     def take(index: int, _: None) -> None:
-        require_trained(tasks[index][1], POLICY)
+        folder = tasks[index][1]
+        if not (folder / POLICY).exists():
+            raise ExecutorError(
+                f"a worker has trained in {folder}, which is not on a disk that it shares "
+                "with this machine: choose an --output that all nodes have"
+            )
 
     run_shown(executor, work, tasks, take, desc="training", unit="training")
-
-
-def require_trained(folder: Path, file: str) -> None:
-    """Refuse the end of a training whose folder does not have its file.
-
-    Raises:
-        ExecutorError: The worker writes to another disk than this machine's.
-    """
-    if not (folder / file).exists():
-        raise ExecutorError(
-            f"a worker has trained in {folder}, which is not on a disk that it shares "
-            "with this machine: choose an --output that all nodes have"
-        )
 
 
 def _train_there(task: tuple[TrainingPlan, Path], records: Records, threads: int) -> None:
