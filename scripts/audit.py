@@ -15,22 +15,20 @@ from agents.audit.report import audit_environment, audit_one_run
 from agents.environments import heading, make_config, make_vector, parse_env, quietly
 from agents.files import write_json
 from dptse_env.utils.files import require_output
-from dptse_env.utils.validation import inside, integer, positive, require
+from dptse_env.utils.validation import integer, positive
 from dptse_env.versions import versions_with
-from scripts.cli import Command, Environment, Machines, Policies, Replacing, Seed, require_open
+from scripts.cli import Command, Environment, Machines, Replacing, Seed, require_open
 
 RESULT = "audit.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(Replacing, Seed, Policies, Environment, Machines, Command):
+class Args(Replacing, Seed, Environment, Machines, Command):
     """Audit the privacy of an environment."""
 
     env: str = "dptse_env:dptse/PrivateHighway-v1"
     target: str = "worst-case"
     """Vehicle that differs: worst-case, replaced or deleted."""
-    policies: tuple[str, ...] = ("hunter",)
-    """Queries, one policy: hunter, or a public schedule (shift-ahead, static, round-robin)."""
     trials: int = 5000
     """Runs in each of the two worlds."""
     one_run: bool = False
@@ -39,8 +37,6 @@ class Args(Replacing, Seed, Policies, Environment, Machines, Command):
     """Factor on the real noise, not the declared one; below 1 is to be rejected."""
     traffic_seed: int = 0
     """Traffic seed of the record."""
-    confidence: float = 0.95
-    """Confidence of the lower bounds."""
     output: Path = Path("results/audit")
 
 
@@ -51,30 +47,25 @@ def main(args: Args) -> None:
     integer("traffic_seed", args.traffic_seed, 0)
     integer("seed", args.seed, 0)
     positive("noise_factor", args.noise_factor)
-    inside("confidence", args.confidence, 0.0, 1.0)
-    require(len(args.policies) == 1, "policies", "one policy", args.policies)
     env, keywords = parse_env(args.env)
     require_open(keywords)
     with quietly():
         make_vector(env, 1, keywords).process  # noqa: B018 (an estimator may refuse the road)
     config = make_config(env, keywords)
     if args.one_run:
-        unused = "target", "policies", "trials", "executor", "address"
-        args.require_unset("with --one-run", *unused)
-    Planner(config, *args.policies).require_kind(args.target)
+        args.require_unset("with --one-run", "target", "trials", "executor", "address")
+    Planner(config).require_kind(args.target)
     require_output(args.output, [RESULT], force=args.force)
 
     executor = args.start_executor()
     library = args.library(config.corridor, [args.traffic_seed])
     record = library.get(config.corridor, args.traffic_seed).vehicles_for("an audit")
-    options: dict[str, Any] = {
-        name: getattr(args, name) for name in ("noise_factor", "confidence", "seed")
-    }
+    options: dict[str, Any] = {"noise_factor": args.noise_factor, "seed": args.seed}
     if args.one_run:
         finding = audit_one_run(config, record, **options)
     else:
         options |= {"trials": args.trials, "executor": executor}
-        finding = audit_environment(config, record, args.target, *args.policies, **options)
+        finding = audit_environment(config, record, args.target, **options)
     found = finding.to_dict() | {
         "arguments": {key: str(value) for key, value in dataclasses.asdict(args).items()},
         "versions": versions_with("numpy", "scipy"),

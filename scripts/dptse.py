@@ -41,7 +41,7 @@ GONE = {
 """What has the place of commands that there were."""
 
 RENAMED: dict[str, dict[str, str]] = {
-    "audit": {"--policy": "--policies", "--runs": "--trials"},
+    "audit": {"--runs": "--trials"},
     "evaluate": {
         "--schedules": "--policies",
         "--seeds": "--test-seeds",

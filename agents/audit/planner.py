@@ -20,12 +20,6 @@ from dptse_env.utils.validation import require
 KINDS = ("worst-case", "replaced", "deleted")
 """Kinds of targets; see `Planner.choose`."""
 
-PUBLIC_SCHEDULES = ("shift-ahead", "static", "round-robin")
-"""Schedules that ignore observations: their queries are known beforehand."""
-
-POLICIES = ("hunter", *PUBLIC_SCHEDULES)
-"""Names of the query policies."""
-
 SHORTLIST = 12
 """Partners to try for the best vehicle. The best partners stand in one jam and are alike, so the
 list grows sparser down the ranking instead of ending early."""
@@ -37,7 +31,7 @@ Second = tuple[float, int, int, int]  # a cost, a step, a segment and the world 
 
 
 def public_plan(config: EnvConfig, name: str) -> BoolArray:
-    """Return the queries of a public schedule, shape (horizon, G)."""
+    """Return the queries of a schedule that ignores observations, shape (horizon, G)."""
     interface = make_interface(config)
     steps = np.arange(config.horizon_steps)
     size = interface.observations.space.shape[0]
@@ -53,19 +47,13 @@ class Planner:
 
     Attributes:
         config: The configuration under attack.
-        policy: The query policy, one of `POLICIES`.
         replaces: Whether adjacent records differ in a vehicle replaced by another, or in one more.
         is_event: Whether a single second of a trip is protected, not the trip.
     """
 
-    def __init__(self, config: EnvConfig, policy: str = "hunter") -> None:
-        """Make the release model.
-
-        Raises:
-            ValueError: There is no such policy.
-        """
-        require(policy in POLICIES, "policies", f"one of {list(POLICIES)}", policy)
-        self.config, self.policy = config, policy
+    def __init__(self, config: EnvConfig) -> None:
+        """Make the release model."""
+        self.config = config
         self.replaces = getattr(config.privacy, "adjacency", "replace") == "replace"
         self.is_event = getattr(config.privacy, "unit", "trip") == "event"
         self._release, corridor = make_release(config), config.corridor
@@ -107,7 +95,7 @@ class Planner:
         require(kind in self.kinds, "target", f"one of {list(self.kinds)} here", kind)
 
     def choose(self, record: Record, kind: str) -> Worlds:
-        """Return the two worlds of a kind that the policy distinguishes best.
+        """Return the two worlds of a kind that a hunter distinguishes best.
 
         Args:
             record: The traffic.
@@ -171,8 +159,7 @@ class Planner:
         speed = record.speed[rows].astype(np.float64)
         moves = self.moves(record, Trajectory(step, segment, speed), is_in_record=True)
         squares = np.sum(moves**2, axis=1)
-        # A schedule meets a vehicle when it does; a hunter picks the seconds that reveal most.
-        always = np.isin(segment, self._always) | (self.policy in PUBLIC_SCHEDULES)
+        always = np.isin(segment, self._always)
         vehicles, starts = np.unique(record.vehicle[rows].astype(np.int64), return_index=True)
         trips = [slice(*ends) for ends in pairwise([*starts.tolist(), len(rows)])]
         asked = np.array([squares[trip].sum() for trip in trips])
@@ -240,22 +227,19 @@ class Planner:
         return Worlds.adjacent(rest, pair, description)
 
     def _reached(self, worlds: Worlds) -> float:
-        """Return the mean distance that the policy reaches between two worlds in some runs."""
+        """Return the mean distance that a hunter reaches between two worlds in some runs."""
         runs = attack(self.config, worlds, self.plan(worlds), REHEARSALS, progress=False)
         return float(runs.distances.mean())
 
     # Queries ------------------------------------------------------------------------------------
 
     def plan(self, worlds: Worlds) -> BoolArray:
-        """Return the policy's queries, shape (horizon, G).
+        """Return the queries of a hunter, shape (horizon, G).
 
-        A hunter follows the vehicle in both worlds, and queries it in the seconds that tell most,
+        He follows the vehicle in both worlds, and queries it in the seconds that tell most,
         within the bandwidth; and after them, when a ledger should refuse it.
         """
-        config = self.config
-        if self.policy in PUBLIC_SCHEDULES:
-            return public_plan(config, self.policy)
-        cost, bandwidth = self._queries.cost, config.bandwidth
+        config, cost, bandwidth = self.config, self._queries.cost, self.config.bandwidth
         plan = np.zeros((config.horizon_steps, len(cost)), dtype=bool)
         candidates, left = [], []
         for world in (0, 1):
@@ -327,7 +311,7 @@ class Planner:
         """Return by how much a vehicle moves the releases that it is in, second by second.
 
         Density, and mean speed or flow, in units of the noise, shape (m, 2); zeros for the seconds
-        that the policy cannot observe.
+        that nobody can observe.
 
         Args:
             record: The traffic.
@@ -354,19 +338,15 @@ class Planner:
     def _typical(self, record: Record) -> tuple[FloatArray, FloatArray]:
         """Return `public_terms` of an episode over the first record that was asked for."""
         if self._terms is None:
-            schedule = self.policy if self.policy in PUBLIC_SCHEDULES else "round-robin"
-            self._terms = public_terms(self.config, record, public_plan(self.config, schedule))
+            plan = public_plan(self.config, "round-robin")
+            self._terms = public_terms(self.config, record, plan)
         return self._terms
 
     def _observable(self, record: Record) -> BoolArray:
-        """Return flags of record columns the policy may observe, (n_steps, n_columns)."""
+        """Return flags of record columns that can be observed, (n_steps, n_columns)."""
         observed = np.zeros((record.n_steps, record.n_columns), dtype=bool)
-        is_public = self.policy in PUBLIC_SCHEDULES
-        queried: BoolArray | bool = True
-        if is_public:
-            queried = self._queries.covered(public_plan(self.config, self.policy))
         seconds = slice(1, self.config.horizon_steps + 1)
-        observed[seconds, : self.config.corridor.geometry.n_mainline] = queried
+        observed[seconds, : self.config.corridor.geometry.n_mainline] = True
         observed[seconds, self._always] = True
         return observed
 

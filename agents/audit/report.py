@@ -29,7 +29,6 @@ class Attack(NamedTuple):
 
     Attributes:
         target: The difference of the two worlds, or of all canaries, in words.
-        policy: The queries.
         distance: Largest distance between the worlds' true sums, in units of the noise: the
             largest mu that this attack can show. For one run, the distance at which equal canaries
             would expect as many errors.
@@ -37,7 +36,6 @@ class Attack(NamedTuple):
     """
 
     target: str
-    policy: str
     distance: float
     result: AuditResult
 
@@ -69,7 +67,7 @@ class Finding:
         """Return the bounds and what they rest on; the verdict is the last line."""
         columns = "claimed", "lower\nbound", "threshold", "false +", "false -"
         table = make_table(title, "", *columns)
-        target, policy, distance, result = self.attack
+        target, distance, result = self.attack
         claim = result.claim
         rows = [("mu", claim.mu, result.mu)]
         if result.epsilon is not None:
@@ -85,7 +83,7 @@ class Finding:
         if result.most <= claim.mu:
             most += ": too few to reject this claim, however much leaks"
         lines = [
-            f"worlds: {target}; queries: {policy}; noise x {self.noise_factor:g}",
+            f"worlds: {target}; noise x {self.noise_factor:g}",
             f"distance: {distance:.3f} standard deviations {trials} ({self.seconds:.0f} s), "
             f"{distance / claim.mu:.4f} times the claim",
             most,
@@ -119,11 +117,9 @@ def audit_environment(
     config: EnvConfig,
     record: Record,
     target: str = "worst-case",
-    policy: str = "hunter",
     *,
     trials: int = 5000,
     noise_factor: float = 1.0,
-    confidence: float = 0.95,
     seed: int = 0,
     executor: Executor = this_process,
 ) -> Finding:
@@ -133,26 +129,24 @@ def audit_environment(
         config: The configuration under attack, of `agents.environments.make_config`.
         record: The traffic, whose vehicles are known.
         target: Kind of the vehicle that differs, in `agents.audit.planner.KINDS`.
-        policy: Queries, in `agents.audit.planner.POLICIES`.
         trials: Runs in each of the two worlds, >= 2.
         noise_factor: Multiplies the real noise, not the declared one.
-        confidence: Confidence of the lower bounds.
         seed: Seeds the noise, >= 0.
         executor: Plays the runs.
 
     Raises:
-        ValueError: A kind or policy is unknown or does not suit the environment, the record has too
-            few vehicles, or the release model cannot be checked (`residuals_of`).
+        ValueError: The kind is unknown or does not suit the environment, the record has too few
+            vehicles, or the release model cannot be checked (`residuals_of`).
     """
-    planner = Planner(config, policy)
+    planner = Planner(config)
     planner.require_kind(target)
 
     def attacked(claim: Claim) -> Attack:
         worlds = planner.choose(record, target)
         options: dict[str, Any] = {"noise_factor": noise_factor, "seed": seed, "executor": executor}
         runs = attack(config, worlds, planner.plan(worlds), trials, **options)
-        result = audit(runs.scores[0], runs.scores[1], claim, confidence)
-        return Attack(worlds.description, policy, float(runs.distances.max()), result)
+        result = audit(runs.scores[0], runs.scores[1], claim)
+        return Attack(worlds.description, float(runs.distances.max()), result)
 
     return _finding(config, record, attacked, noise_factor, seed)
 
@@ -162,7 +156,6 @@ def audit_one_run(
     record: Record,
     *,
     noise_factor: float = 1.0,
-    confidence: float = 0.95,
     seed: int = 0,
 ) -> Finding:
     """Test the noise, and the claim to users on one episode with many canaries.
@@ -174,7 +167,6 @@ def audit_one_run(
         config: The configuration under attack, of `agents.environments.make_config`.
         record: The other vehicles.
         noise_factor: Multiplies the real noise, not the declared one.
-        confidence: Confidence of the lower bound on mu.
         seed: Seeds coins and noise, >= 0.
 
     Raises:
@@ -184,8 +176,8 @@ def audit_one_run(
     def attacked(claim: Claim) -> Attack:
         run = attack_in_one_run(config, record, noise_factor=noise_factor, seed=seed)
         target = f"each added vehicle {KINDS[run.design.kind]}, for {run.design.slot} s"
-        result = audit_coins(run.scores, run.coins, claim, confidence)
-        return Attack(target, "where they are", run.distance, result)
+        result = audit_coins(run.scores, run.coins, claim)
+        return Attack(target, run.distance, result)
 
     return _finding(config, record, attacked, noise_factor, seed)
 

@@ -49,13 +49,13 @@ def staying(segment, speed=0.0):
     return Trajectory.constant(SECONDS, segment, speed)
 
 
-def runs_of(setting, worlds, n_runs=2, policy="hunter", **options):
-    """Attack with the plan of a policy, or one that is given."""
-    plan = Planner(setting, policy).plan(worlds) if isinstance(policy, str) else policy
+def runs_of(setting, worlds, n_runs=2, plan=None, **options):
+    """Attack with the plan of a hunter, or one that is given."""
+    plan = Planner(setting).plan(worlds) if plan is None else plan
     return attack(setting, worlds, plan, n_runs, progress=False, **options)
 
 
-def reached(setting, worlds, policy="hunter", n_runs=2):
+def reached(setting, worlds, plan=None, n_runs=2):
     """The largest distance of some runs over mu."""
-    distances = runs_of(setting, worlds, n_runs, policy).distances
+    distances = runs_of(setting, worlds, n_runs, plan).distances
     return distances.max() / privacy_report(setting).mu

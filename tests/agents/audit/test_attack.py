@@ -93,7 +93,7 @@ def sums_in(record, setting, observed, terms):
 def test_the_score_is_the_log_likelihood_ratio_of_the_transcript(setting, factor, record):
     """Against ledgers in plain Python, on a schedule that mostly looks elsewhere."""
     setting = attacked_form(setting)
-    worlds = Planner(setting, "shift-ahead").choose(record, "replaced")
+    worlds = Planner(setting).choose(record, "replaced")
     process, release = make_overheard(setting, worlds, 2, factor)
     plan, heard = public_plan(setting, "shift-ahead"), []
     # What is left of runs before must not matter.
@@ -168,10 +168,10 @@ def test_only_prices_and_centres_need_the_estimator_of_the_environment():
 # --- what is found --------------------------------------------------------------------------------
 
 
-def verdict(setting, worlds, n_runs=400, policy="hunter", **options):
+def verdict(setting, worlds, n_runs=400, plan=None, **options):
     mu = privacy_report(setting).mu
     claim = Claim(mu, epsilon_of(mu, 0.05), 0.05)
-    return audit(*runs_of(setting, worlds, n_runs, policy, **options).scores, claim).verdict
+    return audit(*runs_of(setting, worlds, n_runs, plan, **options).scores, claim).verdict
 
 
 @pytest.mark.parametrize("setting", [config(epsilon=5.0), paced("ekf")])
@@ -191,10 +191,10 @@ def test_noise_times_0709_is_rejected_after_five_thousand_runs(setting, record):
 
 def test_a_cap_that_is_not_held_is_rejected(record, monkeypatch):
     setting = config(epsilon=5.0, cap=6)
-    worlds = Planner(setting, "static").choose(record, "worst-case")
-    assert verdict(setting, worlds, policy="static") == "not rejected"
+    worlds = Planner(setting).choose(record, "worst-case")
+    assert verdict(setting, worlds) == "not rejected"
     monkeypatch.setattr(CappedSettings, "contribution_cap", None)
-    assert verdict(setting, worlds, policy="static") == "rejected"
+    assert verdict(setting, worlds) == "rejected"
 
 
 class AskedTooOften(Capped):
@@ -212,9 +212,9 @@ def test_a_mechanism_of_ones_own_is_caught(mechanism, record):
     worlds = Worlds.adjacent(record, (staying(1), staying(3)))
     everything = np.ones((HORIZON, ROAD.geometry.n_mainline), dtype=bool)
     setting = dataclasses.replace(setting, bandwidth=ROAD.geometry.n_mainline)
-    assert verdict(setting, worlds, policy=everything) == "rejected"
+    assert verdict(setting, worlds, plan=everything) == "rejected"
     sound = config(ROAD.geometry.n_mainline, epsilon=5.0, cap=2)
-    assert verdict(sound, worlds, policy=everything) == "not rejected"
+    assert verdict(sound, worlds, plan=everything) == "not rejected"
 
 
 class Silent(ReleaseModel):
@@ -230,4 +230,4 @@ class Silent(ReleaseModel):
 def test_what_cannot_be_audited_is_refused(record):
     worlds = Worlds.adjacent(record, (staying(1), staying(3)))
     with pytest.raises(ValueError, match=r"a release model with Gaussian noise.*Silent"):
-        runs_of(config(preset=Silent), worlds, policy=np.ones((HORIZON, 6), dtype=bool))
+        runs_of(config(preset=Silent), worlds, plan=np.ones((HORIZON, 6), dtype=bool))

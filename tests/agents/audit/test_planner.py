@@ -82,8 +82,7 @@ MORE_CAPPED = [
 def test_the_worst_case_is_the_whole_of_mu(setting, record):
     worlds = Planner(setting).choose(record, "worst-case")
     assert reached(setting, worlds) == pytest.approx(1.0, rel=1e-9)
-    seen_by_a_schedule = Planner(setting, "static").choose(record, "worst-case")
-    assert reached(setting, seen_by_a_schedule, "static") <= 1.0 + 1e-9
+    assert reached(setting, worlds, public_plan(setting, "static")) <= 1.0 + 1e-9
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "open_loop"])
@@ -146,54 +145,48 @@ PACED = [
     {"epsilon": 0.1},
 ]
 FEW = [
-    ("deleted", config(cap=2), "round-robin"),
-    ("replaced", config(boundary_inputs="private"), "hunter"),
-    ("worst-case", paced("random_walk", adjacency="add_remove", ratio=20.0), "hunter"),
-    ("deleted", paced("random_walk", unit="event"), "hunter"),
+    ("deleted", config(cap=2)),
+    ("replaced", config(boundary_inputs="private")),
+    ("worst-case", paced("random_walk", adjacency="add_remove", ratio=20.0)),
+    ("deleted", paced("random_walk", unit="event")),
 ]
 ALL = [
-    (kind, setting, policy)
+    (kind, setting)
     for kind in KINDS
-    for policy, settings in (
-        ("hunter", [*(paced("random_walk", **each) for each in PACED), *CAPPED, *MORE_CAPPED]),
-        ("static", [paced("random_walk"), *CAPPED]),
-    )
-    for setting in settings
+    for setting in (*(paced("random_walk", **each) for each in PACED), *CAPPED, *MORE_CAPPED)
     if setting.privacy.adjacency == "replace" or kind != "replaced"
-    if (kind, setting, policy) not in FEW
+    if (kind, setting) not in FEW
 ]
 
 
-@pytest.mark.parametrize("policy", ["hunter", "round-robin"])
 @pytest.mark.parametrize("spans", [(1, 2), (2,)])
-def test_options_of_several_segments_reach_mu_and_no_more(spans, policy, record):
+def test_options_of_several_segments_reach_mu_and_no_more(spans, record):
     setting = dataclasses.replace(paced("ekf", bandwidth=3), query_spans=spans)
-    planner = Planner(setting, policy)
-    for kind in ("worst-case", "replaced"):
+    planner = Planner(setting)
+    for kind, least in (("worst-case", 0.95), ("replaced", 0.5)):
         worlds = planner.choose(record, kind)
         plan = planner.plan(worlds)
         assert (plan @ setting.queries.cost).max() <= 3
-        least = 0.95 if (kind, policy) == ("worst-case", "hunter") else 0.5
-        assert least < reached(setting, worlds, policy) <= 1.0 + 1e-9
+        assert least < reached(setting, worlds, plan) <= 1.0 + 1e-9
 
 
-@pytest.mark.parametrize(("kind", "setting", "policy"), fast_and_slow([*FEW, *ALL], FEW))
-def test_no_target_exceeds_mu(kind, setting, policy, record):
-    worlds = Planner(setting, policy).choose(record, kind)
-    assert reached(setting, worlds, policy) <= 1.0 + 1e-9
+@pytest.mark.parametrize(("kind", "setting"), fast_and_slow([*FEW, *ALL], FEW))
+def test_no_target_exceeds_mu(kind, setting, record):
+    worlds = Planner(setting).choose(record, kind)
+    for plan in (None, public_plan(setting, "round-robin")):
+        assert reached(setting, worlds, plan) <= 1.0 + 1e-9
     if setting.privacy.unit == "event":
         assert {len(path.step) for path in worlds.pair} <= {0, 1}
         assert len({int(step) for path in worlds.pair for step in path.step}) == 1
 
 
-@pytest.mark.parametrize("policy", ["hunter", "round-robin"])
 @pytest.mark.parametrize("setting", [config(preset="corrected"), config(cap=2), paced(pace=0.05)])
-def test_the_vehicle_that_is_deleted_tells_most(setting, policy, record):
-    chosen = reached(setting, Planner(setting, policy).choose(record, "deleted"), policy)
+def test_the_vehicle_that_is_deleted_tells_most(setting, record):
+    chosen = reached(setting, Planner(setting).choose(record, "deleted"))
     everyone = []
     for vehicle in range(record.n_vehicles):
         pair = Trajectory.from_record(record, vehicle), Trajectory.absent()
-        everyone.append(reached(setting, Worlds.adjacent(record.without(vehicle), pair), policy))
+        everyone.append(reached(setting, Worlds.adjacent(record.without(vehicle), pair)))
     # Prices are those of a typical episode, so that it is not always the best.
     least = 0.95 if setting.privacy.preset == "paced" else 1.0 - 1e-9
     assert chosen >= least * max(everyone)
