@@ -112,9 +112,13 @@ def main(args: Args) -> None:
 
 
 def play(name: str, cells: tuple[Cell, ...], seeds: tuple[int, ...], place: Place) -> pl.DataFrame:
-    """Return the rows of cells; a folder may have others, of earlier runs."""
+    """Return the rows of cells on some traffic; a folder may have others, of earlier runs."""
     rows = play_study(Study(name, cells, seeds, lambda rows, folder: ""), place)
-    return rows.filter(pl.col("cell").is_in([cell.id for cell in cells]), are_present(rows))
+    return rows.filter(
+        pl.col("cell").is_in([cell.id for cell in cells]),
+        pl.col("traffic_seed").is_in(seeds),
+        are_present(rows),
+    )
 
 
 # Comparisons.

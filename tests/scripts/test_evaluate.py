@@ -140,6 +140,10 @@ def test_it_goes_on_wherever_it_was_ended(tmp_path, monkeypatch):
         assert "begins anew" in run_command(*words, "--force").stderr
     assert {path.name for path in out.iterdir()} == {"rows.parquet", "errors.png"}
     assert len(played) == 7
+    words[words.index("2000:2002")] = "2001"  # what is left has another seed, which is not asked
+    found = json.loads(run_command(*words, "--json").stdout)
+    assert {row["means"]["error"]["n"] for row in found["rows"]} == {1}
+    assert len(played) == 7
 
 
 def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):
