@@ -16,14 +16,13 @@ from pathlib import Path
 
 import gymnasium as gym
 
+from agents.environments import PAPER, PRIVATE
 from benchmarks.turns import Row, Work, compare, make_batch, repeating, sample, stepping, take_turns
 from dptse_env.config import resolve
 from dptse_env.traffic import Corridor, RecordLibrary, draw_scenario
 from dptse_env.traffic.sumo import running
 from dptse_env.traffic.sumo import seconds as seconds_of
 from dptse_env.utils.threads import n_cores
-
-PAPER, PRIVATE = "dptse_env:dptse/PaperHighway-v0", "dptse_env:dptse/PrivateHighway-v1"
 
 
 def measure(*, quick: bool = False) -> list[Row]:

@@ -15,13 +15,13 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
+from agents.environments import LONG, PRIVATE, SHORT
 from benchmarks.turns import Row, Work, compare, make_batch, repeating, sample, take_turns
 from dptse_env.sb3 import ReplicaBaseline, RoadPolicy, SB3VecEnv
 
-LONG = "dptse_env:dptse/LongHighway-v0"
 ROADS = {
-    "short road": 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1, "horizon": 120}',
-    "the paper's road": 'dptse_env:dptse/PrivateHighway-v1 {"bandwidth": 1, "horizon": 300}',
+    "short road": SHORT + ' {"bandwidth": 1, "horizon": 120}',
+    "the paper's road": PRIVATE + ' {"bandwidth": 1, "horizon": 300}',
     "long road": LONG + ' {"bandwidth": 2, "horizon": 400}',
     "long road, recurrent": LONG + ' {"bandwidth": 2, "horizon": 400, "estimator": "recurrent"}',
 }

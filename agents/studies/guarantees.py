@@ -19,6 +19,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
+from agents.environments import PRIVATE
 from agents.figures import (
     ERROR_TICKS,
     LABELS,
@@ -51,7 +52,6 @@ from dptse_env.privacy import epsilon_of, mu_of, rounded_up
 from dptse_env.release import Paced, Pacing, ReleaseModel, Task, Traffic
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
-ENV = "dptse_env:dptse/PrivateHighway-v1"
 SEEDS = tuple(range(2000, 2020))
 DELTA, CAP = 0.05, 64
 
@@ -117,7 +117,7 @@ def priced(estimator: str, protection: str = TRIP, **changes: Any) -> Cell:
     privacy = {"epsilon": given["epsilon"], "delta": DELTA, "boundary_inputs": given["boundary"]}
     privacy |= PROTECTIONS[protection]
     keywords = {"estimator": estimator, "bandwidth": given["bandwidth"], "privacy": privacy}
-    return Cell(ENV, "shift-ahead", keywords, {"part": "privacy", **given})
+    return Cell(PRIVATE, "shift-ahead", keywords, {"part": "privacy", **given})
 
 
 # Cells of the part "ledger"
@@ -191,7 +191,7 @@ def paid(**changes: Any) -> Cell:
         **QUERIES[given["queries"]],
     }
     labels = {"part": "ledger", **given}
-    return Cell(ENV, given["schedule"], keywords, labels, watchers=("contributions",))
+    return Cell(PRIVATE, given["schedule"], keywords, labels, watchers=("contributions",))
 
 
 # What noise is worth

@@ -27,7 +27,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-from agents.environments import quietly
+from agents.environments import PAPER, quietly
 from agents.figures import (
     COLOURS,
     ERROR_TICKS,
@@ -62,7 +62,7 @@ from dptse_env.rendering import History
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.versions import code_version
 
-ENV, SCHEDULE = "dptse_env:dptse/PaperHighway-v0", "shift-ahead"
+SCHEDULE = "shift-ahead"
 SEEDS = tuple(range(2000, 2020))
 PAPER_ESTIMATORS = ("ekf", "ukf", "enkf", "mhe")
 """The paper's estimators, in its order."""
@@ -123,7 +123,7 @@ def once(many: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 PAIRS = [(name, setting) for setting in SETTINGS for name in ESTIMATORS]
 CELLS = tuple(
-    Cell(ENV, SCHEDULE, keywords=labels, labels=labels)
+    Cell(PAPER, SCHEDULE, keywords=labels, labels=labels)
     for labels in once(
         each for pair in PAIRS for field in SWEEPS for each in labels_along(field, *pair)
     )
@@ -155,7 +155,7 @@ def measure_run_time(place: Place) -> pl.DataFrame:
     timed = []
     for labels in once(labels_of(*pair) for pair in PAIRS):
         with quietly():
-            env = gym.make(ENV, **labels, traffic_seeds=list(SEEDS), records=place.records)
+            env = gym.make(PAPER, **labels, traffic_seeds=list(SEEDS), records=place.records)
         evaluate(env, SCHEDULE, SEEDS[:1])  # kernels load before anything counts
         process = env.get_wrapper_attr("process")
         seconds = time_methods(process.estimator, ("predict", "update", "estimate"))
@@ -175,7 +175,7 @@ def measure_space_time(place: Place) -> pl.DataFrame:
     record(CELLS[0].config.corridor, SEEDS[:1], place.records)
     rows = []
     for labels in once(labels_of(*pair, bandwidth=MAP_SEGMENTS) for pair in PAIRS):
-        watched = watch(SCHEDULE, Cell(ENV, SCHEDULE, labels), SEEDS[0], place.records)
+        watched = watch(SCHEDULE, Cell(PAPER, SCHEDULE, labels), SEEDS[0], place.records)
         row = {"version": code_version(), **labels}
         row |= {name: watched.row[name] for name in ("traffic_seed", DENSITY)}
         for name in ("truth", "estimate"):
