@@ -9,7 +9,7 @@ sample. Querying the segments where it is largest comes close to querying by the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -69,12 +69,12 @@ class Practice:
         self.errors: list[Tensor] = []
         self._episodes, self._observation = episodes, episodes.reset()
 
-    def collect(self, settings: Regression, targets: Callable[[QueryProcess], Observation]) -> None:
-        """Act for a round, and keep what is seen and the targets."""
+    def collect(self, settings: Regression) -> None:
+        """Act for a round, and keep what is seen and the squared errors."""
         for second in range(settings.seconds):
             if second % settings.interval == 0:
                 self.seen.append(torch.from_numpy(self._observation.copy()))
-                self.errors.append(torch.from_numpy(targets(self._episodes.env.process)))
+                self.errors.append(torch.from_numpy(squared_errors(self._episodes.env.process)))
             actions, _ = self.policy.predict(self._observation, deterministic=False)
             stepped, *_ = self._episodes.step(actions)
             self._observation = np.asarray(stepped)
@@ -86,11 +86,7 @@ class Practice:
         return ((errors[rows] + FLOOR) * torch.exp(-logs) + logs).mean()
 
 
-def regress(
-    practice: Sequence[Practice],
-    settings: Regression,
-    targets: Callable[[QueryProcess], Observation] = squared_errors,
-) -> None:
+def regress(practice: Sequence[Practice], settings: Regression) -> None:
     """Let policies act, and fit their common scores in place to the squared errors that follow.
 
     With the expected squared error exp(z) of a segment, the loss y exp(-z) + z is that of normal
@@ -102,7 +98,6 @@ def regress(
     Args:
         practice: Policies that share a scorer, each in an environment of its own.
         settings: Of the regression.
-        targets: Squared errors of a process.
     """
     policy, bonus = practice[0].policy, {"age": settings.age_bonus}
     levels = torch.full((len(practice),), LEVEL, requires_grad=True)
@@ -112,7 +107,7 @@ def regress(
     with make_bar(batches * settings.rounds, desc="regression", unit="batch", leave=False) as bar:
         for index in range(settings.rounds):
             for each in practice:
-                each.collect(settings, targets)
+                each.collect(settings)
             if index:
                 _add(policy, bonus, -settings.sharpness)
             else:
