@@ -113,12 +113,12 @@ def main(args: Args) -> None:
 
 def play(name: str, cells: tuple[Cell, ...], seeds: tuple[int, ...], place: Place) -> pl.DataFrame:
     """Return the rows of cells on some traffic; a folder may have others, of earlier runs."""
-    rows = play_study(Study(name, cells, seeds, lambda rows, folder: ""), place)
-    return rows.filter(
-        pl.col("cell").is_in([cell.id for cell in cells]),
-        pl.col("traffic_seed").is_in(seeds),
-        are_present(rows),
-    )
+    study = Study(name, cells, seeds, lambda rows, folder: "")
+    rows = play_study(study, place)
+    asked = {(cell.id, seed) for cell in cells for seed in study.seeds_of(cell)}
+    keys = ("cell", "traffic_seed")
+    wanted = pl.DataFrame(sorted(asked), schema=keys, orient="row")
+    return rows.filter(are_present(rows)).join(wanted, on=keys, how="semi", maintain_order="left")
 
 
 # Comparisons.
