@@ -52,6 +52,10 @@ def parse_env(text: str) -> tuple[str, dict[str, Any]]:
         spec = gym.spec(name)
     except (gym.error.Error, ModuleNotFoundError):
         spec = None
+    except Exception as problem:
+        raise ValueError(
+            f"env: {module!r} cannot be imported: {type(problem).__name__}: {problem}"
+        ) from problem
     known = ", ".join(ENVIRONMENTS)
     is_own = spec is not None and "preset" in spec.kwargs
     require(is_own, "env", f"the id of an environment of this package, as {known}", env)
@@ -95,7 +99,11 @@ INTERFACE = ("action", "observation", "traffic_seeds", "truth_in_info")
 """Keywords that say what a policy is shown and how it answers, but change no error."""
 
 
-def heading(env: str, config: EnvConfig) -> str:
+CONDITIONS = {"demand", "incident"}
+"""Keywords that change a road."""
+
+
+def heading(env: str, keywords: Mapping[str, Any]) -> str:
     """Return an environment in words: its id and every condition that is not the id's default.
 
     Parameters and the release model with its losses are named in any case. The estimator is left
@@ -103,8 +111,10 @@ def heading(env: str, config: EnvConfig) -> str:
 
     Args:
         env: Id of the environment.
-        config: Its configuration.
+        keywords: Its keywords.
     """
+    with quietly():
+        config = make_config(env, keywords)
     default, privacy = PRESETS[preset_of(env)], config.privacy
     losses = f"epsilon {rounded_up(privacy.epsilon)}, delta {rounded_up(privacy.delta)}"
     said = [
@@ -116,6 +126,11 @@ def heading(env: str, config: EnvConfig) -> str:
     if road.name != default.corridor.name:
         sensors = ", ".join(map(str, road.fixed_sensors)) or "none"
         said.insert(1, f"road {road.name} (fixed sensors {sensors})")
+        if keywords.keys() & CONDITIONS:
+            others = {name: value for name, value in keywords.items() if name not in CONDITIONS}
+            with quietly():
+                own = make_config(env, others).corridor
+            said += _differences("corridor", road.fields(), own.fields())
     else:
         said += _differences("corridor", road.fields(), default.corridor.fields())
     expected = RELEASE_MODELS.find(privacy.preset).settings_type(

@@ -73,4 +73,4 @@ def main(args: Args) -> None:
     args.output.mkdir(parents=True, exist_ok=True)
     write_json(args.output / RESULT, found)
     said = f"the result is in {args.output / RESULT}"
-    args.answer(found, *finding.report(heading(env, config)), said)
+    args.answer(found, *finding.report(heading(env, keywords)), said)

@@ -82,6 +82,7 @@ class Args(
     estimators: tuple[str, ...] = ()
     """Estimators by name or "module:Class"; the environment's own if none."""
     test_seeds: str = "2000:2008"
+    """Traffic seeds, first:stop; the heading names their kind."""
     seed: int = 0
     """Seeds noise and estimators, one stream for each traffic seed."""
     reference: str = "round-robin"
@@ -214,7 +215,7 @@ def make_cells(args: Args) -> tuple[str, tuple[Cell, ...]]:
                     watchers=("honesty",),
                 )
             )
-    return heading(env, config), tuple(cells)
+    return heading(env, given), tuple(cells)
 
 
 def score(rows: pl.DataFrame, cells: Sequence[Cell], reference: str) -> list[Score]:

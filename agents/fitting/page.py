@@ -48,7 +48,7 @@ def write_page(
     """
     road = choice.road
     n, seed = len(road.seeds["test"]), road.seeds["test"][0]
-    config = choice.cell(choice.tested).config
+    cell = choice.cell(choice.tested)
     save_figure(
         draw_episode(choice, seed), folder / EPISODE, f"{road.corridor.name}, traffic seed {seed}"
     )
@@ -61,7 +61,7 @@ def write_page(
     parts = [
         f"# {road.corridor.name}",
         verdict(choice),
-        f"{heading(road.env, config)}.",
+        f"{heading(road.env, cell.all_keywords)}.",
         "Parameters, estimator and policy were chosen on validation traffic. All errors below are "
         f"of test traffic, which was played once. {intervals} χ² is the mean square of errors over "
         "reported deviations: 1 is honest.",

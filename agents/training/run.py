@@ -137,7 +137,8 @@ class Run(TrainingFolder):
         """Write the curve, and draw it with the rules as lines."""
         self.write_curve()
         world = self.plan.worlds[0]
-        title = f"{self.plan.algorithm.name}, validation: {heading(world.env, world.config)}"
+        headed = heading(world.env, world.keywords)
+        title = f"{self.plan.algorithm.name}, validation: {headed}"
         save_figure(draw_curve(self.rows, self.rules), self.folder / CURVE, title)
 
     def _save(self, name: str, policy: BasePolicy, row: Row, scaled: VecNormalize | None) -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from agents.environments import heading, make_config, parse_env, quietly
+from agents.environments import heading, parse_env
 from dptse_env.registration import ENVIRONMENTS
 
 PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
@@ -10,8 +10,7 @@ PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
 
 def headed(text):
     env, keywords = parse_env(text)
-    with quietly():
-        return heading(env, make_config(env, keywords))
+    return heading(env, keywords)
 
 
 def test_the_heading_of_an_id_has_parameters_and_losses_alone():
@@ -37,6 +36,10 @@ def test_the_heading_of_an_id_has_parameters_and_losses_alone():
             '{"corridor": "short-highway", "bandwidth": 2}',
             "road short-highway (fixed",
         ),
+        (
+            '{"corridor": "short-highway", "bandwidth": 2, "incident": "none"}',
+            "corridor.incident None",
+        ),
     ],
 )
 def test_a_heading_names_what_differs(keywords, named):
@@ -48,6 +51,13 @@ def test_another_id_is_refused_with_those_of_this_package(env):
     with pytest.raises(ValueError, match="env must be the id") as refused:
         parse_env(env)
     assert all(name in str(refused.value) for name in ENVIRONMENTS)
+
+
+def test_a_module_that_raises_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "broken_module.py").write_text("1 / 0")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match="'broken_module' cannot be imported: ZeroDivision"):
+        parse_env("broken_module:dptse/ShortHighway-v0")
 
 
 def test_what_follows_an_id_must_be_an_object():
