@@ -26,16 +26,8 @@ from agents.training.run_files import read_progress
 from agents.training.settings import PlackettLuceSettings, parse_algorithm
 from agents.training.training import train, train_all
 from dptse_env.config import parse_seeds
-from dptse_env.utils.validation import integer, read_json
-from scripts.cli import (
-    MOST_WORKERS,
-    Command,
-    Environments,
-    Machines,
-    Output,
-    TrainSeeds,
-    ValidationSeeds,
-)
+from dptse_env.utils.validation import read_json
+from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, ValidationSeeds
 
 MINUTES = 10.0
 """Time of a training where nothing else is given, but for plackett-luce."""
@@ -60,8 +52,6 @@ class Args(Output, Machines, ValidationSeeds, TrainSeeds, Environments, Command)
     """Training seed, or first:stop for several, each in a folder of its own in the output."""
     train_seeds: str = "0:256"
     validation_seeds: str = "1000:1024"
-    threads: int = 1
-    """Threads of torch; numbers depend on it in the last digits."""
     output: Path = Path("results/training")
 
 
@@ -95,7 +85,7 @@ def make_plans(args: Args) -> dict[Path, TrainingPlan]:
 
 def main(args: Args) -> None:
     """Record missing traffic, train, and print the errors of the best policies in validation."""
-    torch.set_num_threads(integer("threads", args.threads, 1, MOST_WORKERS))
+    torch.set_num_threads(1)
     plans = make_plans(args)
     plan = next(iter(plans.values()))
     plan.check()
@@ -105,7 +95,7 @@ def main(args: Args) -> None:
     for world in plan.worlds:
         args.library(world.config.corridor, (*plan.traffic_seeds, *plan.validation_seeds))
     if len(plans) > 1 or args.executor != "local":
-        train_all(plans, executor, records=args.records, threads=args.threads)
+        train_all(plans, executor, records=args.records)
     else:
         train(plan, args.output, records=args.records)
     found: dict[str, Any] = {"trainings": [result(folder) for folder in plans]}

@@ -127,7 +127,6 @@ def train_all(
     executor: Executor,
     *,
     records: Records = None,
-    threads: int = 1,
 ) -> None:
     """Train every plan in its folder to the end; what the folders have is gone on with.
 
@@ -139,7 +138,6 @@ def train_all(
             share them.
         executor: Runs the trainings.
         records: Library of records, or its folder; None for the user's cache.
-        threads: Threads of torch in each training; numbers depend on it in the last digits.
 
     Raises:
         ValueError: A folder belongs to another plan, or its checkpoint is damaged.
@@ -157,7 +155,7 @@ def train_all(
         if traffic not in rules:
             rules[traffic] = keep_rules(plan, folder, records)
         write_json(folder / RULES_FILE, rules[traffic])
-    work = partial(_train_there, records=records, threads=threads)
+    work = partial(_train_there, records=records)
     tasks = [(plan, folder.absolute()) for folder, plan in plans.items()]
 
     def take(index: int, _: None) -> None:
@@ -171,9 +169,9 @@ def train_all(
     run_shown(executor, work, tasks, take, desc="training", unit="training")
 
 
-def _train_there(task: tuple[TrainingPlan, Path], records: Records, threads: int) -> None:
+def _train_there(task: tuple[TrainingPlan, Path], records: Records) -> None:
     plan, folder = task
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     for world in plan.worlds:
         seeds = (*plan.traffic_seeds, *plan.validation_seeds)
         record(world.config.corridor, seeds, records)
