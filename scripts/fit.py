@@ -176,13 +176,13 @@ def fit_road(args: Args, path: Path) -> None:
     folder = args.output or folder_of(path)
     road, stages, copy = checked_road(args, path, folder), folder / STAGES, copy_of(path)
     args.remark("[1/6] record traffic")
-    library = args.library(road.corridor, road.all_seeds)
+    library = args.library(road.config.corridor, road.all_seeds)
     dwell = road.measure_dwell(library)
     keep_plan(folder, road.plan(args.trials))
     road.write_played(stages, dwell)
     choice = Choice(road, args.place(stages), shipped_sets(road))
     args.remark("[2/6] fit ARZ parameters")
-    density, speed = traffic_of(road.corridor, road.seeds["training"], library)
+    density, speed = traffic_of(road.config.corridor, road.seeds["training"], library)
     fit = fitted(choice, library, args.trials, 1.01 * float(density.max()))
     name = fit.parameters.name
     keep(folder / f"{name}.json", fit, road)
@@ -283,7 +283,7 @@ def fitted(choice: Choice, library: RecordLibrary, trials: int, densest: float) 
     start = start_from(load_parameters(base), road.corridor, name)
     cell = choice.cell(choice.labels("training", parameters="", **plain))
     kept = choice.place.folder / SEARCH
-    return fit_parameters(cell, road.corridor, start, densest, library, trials, kept)
+    return fit_parameters(cell, road.config.corridor, start, densest, library, trials, kept)
 
 
 def keep(path: Path, fit: Fit, road: Road) -> None:

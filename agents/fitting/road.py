@@ -49,7 +49,7 @@ class Road:
 
     Attributes:
         path: The road file.
-        corridor: The road.
+        corridor: The road of the file; that of `config` has the demand and incident of `keywords`.
         env: Id of the environment.
         config: The environment, as the file and the keywords make it before the fit.
         keywords: Keywords of every episode that is played, without `CHOSEN`.
@@ -117,9 +117,10 @@ class Road:
         Raises:
             ValueError: No vehicle was ever on the mainline; the message has the file's path.
         """
-        records = (library.get(self.corridor, seed) for seed in self.seeds["training"])
+        corridor = self.config.corridor
+        records = (library.get(corridor, seed) for seed in self.seeds["training"])
         try:
-            return round(average_dwell(self.corridor, records), 2)
+            return round(average_dwell(corridor, records), 2)
         except ValueError as problem:
             raise ValueError(
                 f"{self.path}: no vehicle is on the mainline in training traffic: give the road "
@@ -221,7 +222,7 @@ def seeds_of(kind: str, given: str | None, corridor: Corridor, origin: str) -> t
     Args:
         kind: One of `agents.seeds.KINDS`.
         given: ``"first:stop"``, or None.
-        corridor: The road.
+        corridor: The road of the file; that of `config` has the demand and incident of `keywords`.
         origin: File or environment that the road comes from, for messages.
 
     Raises:

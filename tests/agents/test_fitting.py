@@ -65,6 +65,17 @@ def files_of(folder):
     return {each: each.read_bytes() for each in sorted(folder.rglob("*")) if each.is_file()}
 
 
+def test_the_dwell_is_that_of_the_traffic_which_is_played(tmp_path):
+    path = tmp_path / "my-road.toml"
+    path.write_text(ROAD)
+    seeds = dict(zip(KINDS, ("0", "1000", "2000"), strict=True))
+    dense = '{"demand": {"base": {"mainline": [[0, 3600]]}}}'
+    plain, other = (find_road(path, env, tmp_path, seeds) for env in (ID, f"{ID} {dense}"))
+    library = RecordLibrary()
+    assert other.measure_dwell(library) > plain.measure_dwell(library)
+    assert other.config.corridor.digest != plain.config.corridor.digest
+
+
 def test_the_file_has_the_choice_and_keeps_all_else(fitted):
     path, found = fitted
     text = path.read_text()
