@@ -91,7 +91,7 @@ def finished(journal):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--workers", "0"], "workers must be an integer >= 1, got 0"),
+        (["--workers", "0"], "workers must be an integer in 1..10000, got 0"),
         (["--trials", "0"], "trials must be an integer >= 1, got 0"),
         (["--policies", "random", "round-robin"], "policies must be one with --tune"),
         (["--train-seeds", "2000:2008"], "train_seeds must be traffic seeds"),
