@@ -58,12 +58,15 @@ def main(args: Args) -> None:
             traceback.print_exc()
             failed.append(part)
             continue
-        args.answer(rows, make_table(f"{part}: {title}", *HEADER, rows=rows))
+        if not args.json:  # one document comes at the end
+            args.answer(rows, make_table(f"{part}: {title}", *HEADER, rows=rows))
         measured += rows
         if args.output is not None:
             args.output.mkdir(parents=True, exist_ok=True)
             table = f"# Time of a step\n\n{title}\n\n{markdown(HEADER, measured, ':--', '--:')}\n"
             write_atomically(args.output / "tables.md", table)
+    if args.json:
+        args.answer(measured)
     if failed:
         raise SystemExit(f"error: {', '.join(failed)} failed, see above")
 

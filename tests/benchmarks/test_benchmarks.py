@@ -1,5 +1,6 @@
 """The benchmarks run and pair the turns of a round; no test depends on speed."""
 
+import json
 import re
 import subprocess
 import sys
@@ -66,6 +67,14 @@ def test_a_part_that_fails_loses_nothing_of_the_others(tmp_path, monkeypatch, ca
         benchmarks.main(benchmarks.Args(output=folder))
     for said in (capsys.readouterr().out, (folder / "tables.md").read_text(encoding="utf-8")):
         assert re.findall(r"a step of (\w+)", said) == ["estimators", "learning", "long_roads"]
+
+
+def test_all_parts_are_one_json_document(monkeypatch, capsys):
+    monkeypatch.setattr(benchmarks, "measure", lambda part, quick: [[part, "1.0", "", "", ""]])
+    monkeypatch.setattr(benchmarks, "ProcessPoolExecutor", lambda *_: ThreadPoolExecutor(1))
+    benchmarks.main(benchmarks.Args(json=True))
+    found = json.loads(capsys.readouterr().out)
+    assert [row[0] for row in found] == list(benchmarks.Args.parts)
 
 
 def test_long_roads_have_settings_of_all_estimators():
