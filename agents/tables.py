@@ -13,6 +13,7 @@ from dptse_env.utils.arrays import FloatArray
 from dptse_env.versions import code_version, numbers_of
 
 DENSITY, SPEED, ERROR = "rmse_density", "rmse_speed", "error"
+HONESTY = ("chi2_density", "chi2_speed")
 METRICS = {DENSITY: ("density", "veh/km"), SPEED: ("speed", "km/h")}
 """Name and unit of each error of an estimate; `ERROR` is minus the mean reward, x 1000."""
 
@@ -146,7 +147,12 @@ def below(rows: pl.DataFrame, labels: Labels, reference: Labels) -> Interval:
 
 def chi2(rows: pl.DataFrame, labels: Labels) -> list[float]:
     """Return the mean squares of errors over deviations, of densities and of speeds."""
-    return [mean(rows, labels, f"chi2_{kind}").mean for kind in ("density", "speed")]
+    return [float(values(rows, labels, name).mean()) for name in HONESTY]
+
+
+def chi2_text(rows: pl.DataFrame, labels: Labels) -> str:
+    """Return `chi2` as text."""
+    return ", ".join(f"{each:.2f}" for each in chi2(rows, labels))
 
 
 def markdown(

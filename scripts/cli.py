@@ -52,7 +52,7 @@ MOST_WORKERS = 10_000
 
 @dataclass(frozen=True)
 class Command:
-    """What every command has."""
+    """Options of every command."""
 
     json: bool = False
     """Print JSON, for a program, in place of text."""
@@ -237,13 +237,13 @@ GIVEN = ("traffic_seeds", "records", "threads", "autoreset_mode", "render_mode")
 """Keywords of an environment that a command that plays it gives, or has no use for."""
 
 
-def require_open(keywords: Mapping[str, Any]) -> None:
-    """Refuse keywords in ``--env`` that would be ignored.
+def require_open(keywords: Mapping[str, Any], *others: str) -> None:
+    """Refuse keywords in ``--env`` that would be ignored: `GIVEN`, and others of a command.
 
     Raises:
         ValueError: There is one.
     """
-    for key in GIVEN:
+    for key in (*others, *GIVEN):
         require(key not in keywords, f"env.{key}", "left out", keywords.get(key))
 
 

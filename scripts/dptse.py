@@ -38,7 +38,7 @@ GONE = {
     "policy": "import policy",
     "replay-field": "import field and dptse evaluate",
 }
-"""What has the place of commands that there were."""
+"""Successors of commands that there were."""
 
 RENAMED: dict[str, dict[str, str]] = {
     "audit": {"--runs": "--trials"},
@@ -82,7 +82,7 @@ RENAMED: dict[str, dict[str, str]] = {
         "--validation": "--validation-seeds",
     },
 }
-"""What has the place of options that there were, by command."""
+"""Successors of options that there were, by command."""
 
 MODULES = {name: f"scripts.{name.replace('-', '_')}" for group in GROUPS.values() for name in group}
 MODULES["import"] = "scripts.imports"

@@ -34,6 +34,7 @@ from agents.study import OWN, ROWS, TABLES, Place, Study, play_study, remove_par
 from agents.tables import (
     DENSITY,
     ERROR,
+    HONESTY,
     SPEED,
     are_present,
     below,
@@ -65,7 +66,6 @@ ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
 
 METRICS = (ERROR, DENSITY, SPEED)
-HONESTY = ("chi2_density", "chi2_speed")
 ERRORS, MAPS, PAGE, CARD = "errors.png", "space_time.png", "page.html", "card.json"
 """Files of the figures, of the interactive page, and of an entry to the suite."""
 OUTPUT = Path("results/evaluation")

@@ -62,6 +62,7 @@ from scripts.cli import (
     TestSeeds,
     TrainSeeds,
     ValidationSeeds,
+    require_open,
 )
 
 STAGES, SEARCH, JOURNAL = "stages", "search.json", "trials.journal"
@@ -145,8 +146,7 @@ def make_searches(args: Args) -> tuple[dict[str, Search], Path]:
     policies = args.policies or ("shift-ahead",)
     require(len(policies) == 1, "policies", "one with --tune", policies)
     env, keywords = parse_env(args.env)
-    for key in ("estimator", "traffic_seeds", "records", "action"):
-        require(key not in keywords, f"env.{key}", "left out", keywords.get(key))
+    require_open(keywords, "estimator", "action")
     folder = Path("results") / "tuning"
     if args.road is not None:
         require_road(args.road)

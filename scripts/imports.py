@@ -50,7 +50,7 @@ POLICY = f"policy{SUFFIX}"
 
 @dataclass(frozen=True, kw_only=True)
 class Import(Output, Command):
-    """What all imports have."""
+    """Options of all imports."""
 
     output: Path = field()
     """Folder to create."""
@@ -63,7 +63,7 @@ class Import(Output, Command):
 
 @dataclass(frozen=True, kw_only=True)
 class RoadImport(Import):
-    """What the imports of a road have."""
+    """Options of the imports of a road."""
 
     @property
     def road_file(self) -> Path:
@@ -104,7 +104,7 @@ class RoadImport(Import):
 
 @dataclass(frozen=True, kw_only=True)
 class WindowImport(RoadImport):
-    """What the imports of what was measured have."""
+    """Options of the imports of measured traffic, which is cut into windows."""
 
     shares: tuple[float, float, float] = (0.6, 0.2, 0.2)
     """Shares of the windows for training, validation and test, in this order of time."""

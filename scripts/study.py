@@ -134,23 +134,18 @@ def find_study(args: Args) -> Study:
     )
 
 
-def _suitable(cells: Sequence[Cell]) -> tuple[list[Cell], list[ValueError]]:
+def _suitable(cells: Sequence[Cell]) -> tuple[list[Cell], list[str]]:
     """Return the cells that can be played, and why the others cannot.
 
     Raises:
         FileNotFoundError: There is no such policy.
         ValueError: None can be played.
     """
-    taken, refused = [], []
-    for cell in cells:
-        try:
-            cell.check()
-        except ValueError as problem:
-            refused.append(problem)
-        else:
-            taken.append(cell)
+    problems = [cell.misfit() for cell in cells]
+    taken = [cell for cell, problem in zip(cells, problems, strict=True) if problem is None]
+    refused = [problem for problem in problems if problem is not None]
     if not taken:
-        raise refused[0]
+        raise ValueError(refused[0])
     return taken, refused
 
 

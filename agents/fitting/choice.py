@@ -126,14 +126,11 @@ class Choice:
         cells = {}
         for labels in wanted:
             cell = self.cell(labels, seeds)
-            try:
-                cell.check()
-            except ValueError as problem:
-                tried = ", ".join(f"{key} {value}" for key, value in [*labels.items()][1:])
-                if not any(note.endswith(f": {problem}") for note in self.notes):
-                    self.notes.append(f"refused is {tried}: {problem}")
-            else:
+            if (problem := cell.misfit()) is None:
                 cells[cell.id] = cell
+            elif not any(note.endswith(f": {problem}") for note in self.notes):
+                tried = ", ".join(f"{key} {value}" for key, value in [*labels.items()][1:])
+                self.notes.append(f"refused is {tried}: {problem}")
         study = Study(NAME, tuple(cells.values()), (), lambda rows, folder: "")
         self.rows = play_study(study, self.place)
         return [cell.labels for cell in cells.values()]

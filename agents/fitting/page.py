@@ -23,12 +23,10 @@ from agents.fitting.budget import SEEDS, Errors, advice, budget_table
 from agents.fitting.choice import Choice, interval
 from agents.page import watch
 from agents.statistics import mean_interval
-from agents.tables import DENSITY, ERROR, SPEED, Labels, error_label, markdown, values
+from agents.tables import DENSITY, ERROR, SPEED, Labels, chi2, error_label, markdown, values
 from dptse_env.model import ARZParameters
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import write_atomically
-
-QUANTITIES = "density", "speed"
 
 PAGE, DIAGRAM, EPISODE = "fit.md", "speed-density.png", "episode.png"
 """Files in the folder of a fit."""
@@ -114,10 +112,10 @@ def table(choice: Choice, played: Sequence[Labels]) -> str:
             names = [f"**{name}**" for name in names]
         errors = [interval(values(choice.rows, labels, each)) for each in (ERROR, DENSITY, SPEED)]
         more = "-" if labels == choice.plain else against(choice, labels)
-        chi2 = [f"{values(choice.rows, labels, f'chi2_{q}').mean():.2f}" for q in QUANTITIES]
-        body.append([*names, *errors, more, *chi2])
+        honesty = [f"{each:.2f}" for each in chi2(choice.rows, labels)]
+        body.append([*names, *errors, more, *honesty])
     head = "parameters", "estimator", "policy", *map(error_label, (ERROR, DENSITY, SPEED))
-    return markdown([*head, "against plain", *(f"χ² {q}" for q in QUANTITIES)], body)
+    return markdown([*head, "against plain", "χ² density", "χ² speed"], body)
 
 
 def draw_diagram(

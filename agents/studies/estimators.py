@@ -39,7 +39,7 @@ from agents.tables import (
     SPEED,
     Labels,
     below,
-    chi2,
+    chi2_text,
     format_interval,
     format_range,
     give_or_take,
@@ -189,11 +189,6 @@ def below_ekf(rows: pl.DataFrame, labels: Labels) -> Interval:
     return below(rows, labels, {**labels, "estimator": EKF})
 
 
-def honesty(rows: pl.DataFrame, labels: Labels) -> str:
-    """Return `chi2` as text."""
-    return ", ".join(f"{each:.2f}" for each in chi2(rows, labels))
-
-
 WORLD_NOTES = f"""Round robin, traffic seeds {format_range(SEEDS)}. *Error*: minus the reward after
 the warm-up. *χ²*: mean square of errors over reported deviations, of densities and of speeds."""
 MOVED_NOTES = f"Error x 1000, traffic seeds {format_range(MOVED_SEEDS)}."
@@ -214,11 +209,11 @@ def world_tables(rows: pl.DataFrame) -> list[str]:
         "below EKF [%]": gain,
         "density [veh/km]": lambda c: format_interval(mean(rows, c, DENSITY)),
         "speed [km/h]": lambda c: format_interval(mean(rows, c, SPEED)),
-        "χ²": partial(honesty, rows),
+        "χ²": partial(chi2_text, rows),
     }
     parts.append(table("", lines_of(WORLDS, EVERYONE, in_world), columns))
     columns = {LABELS[each]: partial(error, estimator=each) for each in MOVED}
-    columns |= {"recurrent below EKF [%]": gain, "χ² of recurrent": partial(honesty, rows)}
+    columns |= {"recurrent below EKF [%]": gain, "χ² of recurrent": partial(chi2_text, rows)}
     moved = {world: in_world(world) for world in ELSEWHERE}
     parts += ["## Away from the training", MOVED_NOTES, "![Gains](fig_elsewhere.png)"]
     return [*parts, table("PrivateHighway-v1 but for", moved, columns)]

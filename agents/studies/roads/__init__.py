@@ -36,6 +36,7 @@ from agents.tables import (
     below,
     cell,
     chi2,
+    chi2_text,
     give_or_take,
     mean,
     table,
@@ -231,7 +232,7 @@ def table_of(rows: pl.DataFrame, learned: Learned) -> str:
         return give_or_take(mean(rows, of(estimator, line), ERROR))
 
     def honesty(estimator: str, line: tuple[str, str]) -> str:
-        return ", ".join(f"{each:.2f}" for each in chi2(rows, of(estimator, line)))
+        return chi2_text(rows, of(estimator, line))
 
     def density_ratio(line: tuple[str, str]) -> str:
         errors = [mean(rows, of(each, line), DENSITY).mean for each in (own, "ekf")]
