@@ -289,10 +289,13 @@ def run(
     logging.basicConfig(format="%(message)s")
     try:
         given = parse(arguments, description, program, words, renamed or {})
-        with logging_redirect_tqdm(), warnings_told_once(), interrupted_by_sigterm():
-            is_quiet = getattr(given, "quiet", False)
-            progress.set_quiet(is_quiet)
-            logging.getLogger().setLevel(logging.ERROR if is_quiet else logging.WARNING)
+        is_quiet = getattr(given, "quiet", False)
+        with (
+            _said(not is_quiet),
+            logging_redirect_tqdm(),
+            warnings_told_once(),
+            interrupted_by_sigterm(),
+        ):
             if isinstance(given, Recording):
                 given.check()
             main(given)
@@ -305,6 +308,20 @@ def run(
         goes_on = "goes on from what is done" if resumes else "begins anew"
         print(f"\ninterrupted: the same command {goes_on}", file=sys.stderr)
         raise SystemExit(128 + (*interrupt.args, signal.SIGINT)[0]) from None
+
+
+@contextlib.contextmanager
+def _said(is_said: bool) -> Iterator[None]:
+    """Show warnings and progress, or errors alone."""
+    root = logging.getLogger()
+    before = root.level
+    root.setLevel(logging.WARNING if is_said else logging.ERROR)
+    progress.set_quiet(not is_said)
+    try:
+        yield
+    finally:
+        root.setLevel(before)
+        progress.set_quiet(False)
 
 
 def parse(

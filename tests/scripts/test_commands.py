@@ -4,6 +4,7 @@ import contextlib
 import errno
 import io
 import json
+import logging
 import re
 import shlex
 import shutil
@@ -161,11 +162,13 @@ def test_every_command_can_be_quiet_and_can_print_json(monkeypatch):
             assert {"--json", "--quiet"} <= {*re.findall(r"--[a-z]+", help_of(name, monkeypatch))}
 
 
-def test_a_quiet_command_prints_json_alone():
+def test_a_quiet_command_prints_json_alone_and_silences_nothing_after_it(caplog):
     assert run_command("info", "--quiet") == (0, "", "")
     done = run_command("info", "--quiet", "--json")
     assert "packages" in json.loads(done.stdout)
     assert done.stderr == ""
+    logging.getLogger("dptse_env").warning("said")
+    assert caplog.messages == ["said"]
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch, capsys):
