@@ -60,7 +60,7 @@ from dptse_env.model import ARZModel
 from dptse_env.model.arrays import ARZ, Channels
 from dptse_env.model.step import pressure
 from dptse_env.road import Road
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, all_finite, inline_part, kernel, kernel_part
 from dptse_env.utils.units import HOUR
 
@@ -510,3 +510,7 @@ class AdaptiveSmoothing(SegmentEstimator):
             diverged=self.diverged,
         )
         self.arrays = Bundle(model.road, model.arz, model.channels, stencil, self.state)
+
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        return self.state[: State._fields.index("innovations")]

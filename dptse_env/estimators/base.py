@@ -16,7 +16,7 @@ import numpy as np
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle
 from dptse_env.utils.registry import name_of_class
 
@@ -142,7 +142,8 @@ class Estimator(ABC):
     """Estimator of the traffic state of a batch of episodes, S segments each.
 
     A subclass has `_reset`, `_predict`, `_update` and `_estimate`. It writes `innovations` and
-    `diverged` of the episodes that it updates, and `fallback` too if its update can fail.
+    `diverged` of the episodes that it updates, and `fallback` too if its update can fail. With
+    `_memory` its episodes can go back in time.
 
     Attributes:
         model: The traffic model.
@@ -248,6 +249,25 @@ class Estimator(ABC):
         if self._largest_speed is not None:
             np.minimum(estimate.speed, self._largest_speed, out=estimate.speed)
         return estimate
+
+    @property
+    def memory(self) -> tuple[AnyArray, ...]:
+        """All that an episode's past has left, arrays with an axis over the n episodes in front.
+
+        An episode whose rows are kept, and copied back later or into an estimator that was made
+        alike, goes on from there with the same bits.
+
+        Raises:
+            ValueError: The estimator does not say what it remembers.
+        """
+        return (*self._memory, self.innovations, self.diverged, self.fallback)
+
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        """What `reset`, `predict` and `update` change and read, but for the base class's arrays."""
+        raise ValueError(
+            f"estimator must have _memory to go back in time, got {name_of_class(type(self))}"
+        )
 
     @abstractmethod
     def _reset(

@@ -27,7 +27,7 @@ from dptse_env.model.step import (
     write_channel,
 )
 from dptse_env.road import Road
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import (
     Bundle,
     all_finite,
@@ -95,6 +95,10 @@ class CovarianceFilter(KernelEstimator):
         """Covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f, a copy."""
         lower = np.tril(self.filters.covariances[:, :, : self.model.n_states])
         return np.asarray(lower + np.tril(lower, -1).swapaxes(1, 2))
+
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        return self.filters.means, self.filters.covariances, self.filters.priors
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))

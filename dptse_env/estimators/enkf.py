@@ -33,7 +33,7 @@ from dptse_env.model.columns import (
 )
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.road import Road
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
 
 
@@ -417,6 +417,10 @@ class EnKF(KernelEstimator):
     def _inner(self) -> FloatArray:
         """Members `(n, n_x, n_members)` without padding."""
         return self._ensembles.members[:, :, : self.n_members]
+
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        return self._ensembles.members, self._ensembles.priors, self._ensembles.streams
 
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]

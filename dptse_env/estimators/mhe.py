@@ -8,7 +8,7 @@ which are at the end.
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from dptse_env.model.parameters import (
 )
 from dptse_env.model.step import advance, make_scratch, normalise, project, write_channel
 from dptse_env.road import Road
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import (
     Bundle,
     all_finite,
@@ -409,6 +409,11 @@ class MHE(CovarianceFilter):
         H, q = np.empty((length, n, length, n)), np.empty((length, n))
         write_program(self.arrays, episode, H, q)
         return H.reshape(length * n, length * n), q.ravel()
+
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        windows: tuple[Any, ...] = self._windows[: Windows._fields.index("fallback")]
+        return *super()._memory, *windows
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():

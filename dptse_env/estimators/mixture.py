@@ -11,7 +11,7 @@ from dptse_env.estimators.recurrent import Recurrent
 from dptse_env.estimators.settings import EstimatorSettings, RecurrentSettings
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
-from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
 from dptse_env.utils.validation import within
 
 LEAST_VARIANCE = 1e-12
@@ -82,6 +82,11 @@ class Mixture(Estimator):
         """Densities [veh/km] and speeds [km/h], shape (n, S, 2)."""
         estimate = self._estimate()
         return np.stack([estimate.density, estimate.speed], axis=-1)
+
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        of_experts = (array for expert in self.experts for array in expert.memory)
+        return *of_experts, self._likelihoods.T, self._priors
 
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]

@@ -85,6 +85,11 @@ class Recurrent(SegmentEstimator):
             model.road, model.channels, make_cells(model), memory, self.saved.weights, state
         )  # fmt: skip
 
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        _, _, _, memory, _, state = self.arrays.parts
+        return memory.inputs, memory.present, memory.age, state.hidden, state.ahead, state.priors
+
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
         """Refuse weights that are missing or cannot be read."""

@@ -16,7 +16,7 @@ from dptse_env.estimators.ekf import EKF
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import MEASUREMENT_FLOOR
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, kernel, kernel_part
 
 
@@ -158,6 +158,10 @@ class RandomWalk(KernelEstimator):
         joint[:, every, :, every] = blocks.swapaxes(0, 1)
         return joint.reshape(n_episodes, 2 * n_segments, 2 * n_segments)
 
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        return self._walks.means, self._walks.variances, self._walks.priors
+
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
@@ -206,6 +210,10 @@ class Blend(Estimator):
     def covariances(self) -> FloatArray:
         """The EKF's covariances `(n, n_x, n_x)`, rho normalised by rho_m and psi by rho_m v_f."""
         return self.ekf.covariances
+
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        return *self.ekf.memory, *self.walk.memory, self._priors
 
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
@@ -265,6 +273,10 @@ class OpenLoop(Estimator):
         super().__init__(model, n_episodes, settings)
         self.states = model.project(np.zeros((n_episodes, model.n_states)), settings.bounds)
         self._priors = self.states.copy()
+
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        return self.states, self._priors
 
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]

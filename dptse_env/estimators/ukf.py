@@ -41,7 +41,7 @@ from dptse_env.model.columns import (
     project_states,
 )
 from dptse_env.model.step import project
-from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import (
     Bundle,
     all_finite,
@@ -284,6 +284,10 @@ class UKF(CovarianceFilter):
             spread=float(np.sqrt(spread)),
         )
         self.arrays = Bundle(*model.dynamics, self.filters, self._points)
+
+    @property
+    def _memory(self) -> tuple[AnyArray, ...]:
+        return *super()._memory, self._points.states, self._points.moved
 
     def _restart(self, episodes: IntArray) -> None:
         self._points.moved[episodes] = False

@@ -25,6 +25,7 @@ from .helpers import (
     EVERY,
     FIELDS,
     PLAIN,
+    RICH,
     Snapshot,
     assert_same,
     every_channel,
@@ -195,6 +196,35 @@ def test_the_seed_decides_and_the_global_generator_is_left_alone(name, backend, 
     run(third, episodes, range(n_steps))
     draws = name == "enkf"
     assert np.array_equal(show(first).density, show(third).density) != draws
+
+
+REMEMBERING = [case for case in CASES if case[1] == "compiled"]
+
+
+@over(cases=REMEMBERING)
+def test_an_episode_goes_on_from_what_was_kept_of_it(name, backend, release):
+    """Back in the same estimator, and in another one, with the same bits; others do not move."""
+    episodes = simulate(n=3, n_steps=40, release=release)
+    settings = RICH if ESTIMATORS.find(name).has_demand else PLAIN
+    estimator, which = started(name, backend, episodes, settings), [0, 2]
+    run(estimator, episodes, range(25))
+    kept = [array[which].copy() for array in estimator.memory]
+    run(estimator, episodes, range(25, 40))
+    once, alone = show(estimator), started(name, backend, episodes, settings)
+    for each in (estimator, alone):
+        for array, rows in zip(each.memory, kept, strict=True):
+            array[which] = rows
+        for k in range(25, 40):
+            step(each, episodes, k, which)
+    assert_same(show(estimator), once)
+    assert_same(show(alone), once, which, which)
+    assert not np.array_equal(show(alone).density[1], once.density[1])
+
+
+def test_who_does_not_say_what_it_remembers_is_named():
+    for name in REFERENCES:
+        with pytest.raises(ValueError, match=r"must have _memory .*, got .*:Reference"):
+            _ = make_estimator(name, "reference", MODEL, 1).memory
 
 
 # Soundness ----------------------------------------------------------------------------------------
