@@ -264,6 +264,9 @@ def _corridor(path: str, value: Any, base: Corridor) -> Corridor:
         source = randomised(corridor) if name == "random" else corridor
         given = None if name == "none" else getattr(source.conditions, key)
         corridor = corridor.replaced(**{key: given})
+    passed = "None on a road of measured fields, which say who passes of nobody"
+    countable = corridor.loops is None or has_vehicles(corridor.recordings)
+    require(countable, f"{path}.loops", passed, corridor.loops)
     return corridor
 
 
@@ -376,6 +379,8 @@ def _spans(
     spans: tuple[int, ...] = _typed(path, value, base)
     n = corridor.geometry.n_mainline
     check_spans(n, spans)
+    alone = "numbers with 1 among them on a road with loops, which say something of one segment"
+    require(1 in spans or corridor.loops is None, path, alone, spans)
     if max(spans) > 1:
         model = RELEASE_MODELS.find(privacy.preset)
         plain = f"(1,) {_with_model(privacy)}, which releases no sums"
@@ -516,7 +521,8 @@ KEYWORDS = {
 """The keywords of an environment, each after those that it needs: the fields of `EnvConfig`."""
 
 SHORTCUTS = {
-    "demand": "corridor", "incident": "corridor", "epsilon": "privacy", "delta": "privacy",
+    "demand": "corridor", "incident": "corridor", "loops": "corridor", "epsilon": "privacy",
+    "delta": "privacy",
 }  # fmt: skip
 """Keywords that stand for a field of another one."""
 

@@ -13,7 +13,14 @@ import numpy as np
 
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate, Estimator, Measurement, make_estimator
-from dptse_env.measurement import BOUNDARIES, DetectorErrors, Fusion, nominal_state
+from dptse_env.measurement import (
+    BOUNDARIES,
+    DetectorErrors,
+    Fusion,
+    LoopReadings,
+    Replay,
+    nominal_state,
+)
 from dptse_env.model import ARZModel
 from dptse_env.parts import (
     QueryInterface,
@@ -70,6 +77,7 @@ class QueryProcess:
         estimator: The estimator.
         detectors: Errors of the fixed sensors; None where they have none.
         fusion: Turns releases into measurements of all vehicles; None where they are these.
+        loops: Readings of loop detectors; None where there are none.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
         start: Second that it began at, below 0 before its first reset, shape (n,).
@@ -127,6 +135,10 @@ class QueryProcess:
         is_fused = config.has_separate_sensors
         self.fusion = Fusion(task, config.fusion, share) if is_fused else None
         self._threads = EpisodeThreads(threads if self.estimator.is_compiled else 1)
+        self.loops, self._replay = None, None
+        if config.corridor.loops is not None:
+            self.loops = LoopReadings(task, self.traffic)
+            self._replay = Replay(self.loops, self.estimator, task, self._threads)
         self._checks_estimates = is_foreign(self.estimator)
         self._checks_releases = is_foreign(self.release)
         self._checks_decisions = is_foreign(self.interface.actions)
@@ -158,7 +170,7 @@ class QueryProcess:
             raise RuntimeError("a process whose privacy.noise is 'secure' has no forks")
         shared = (
             self.config, self.interface, self.model, self.traffic, self._threads,
-            self.release.task, *self.boundary.shared,
+            self.release.task, *self.boundary.shared, *(self.loops.shared if self.loops else ()),
         )  # fmt: skip
         fork = copy.deepcopy(self, {id(item): item for item in shared})
         fork._is_fork = True
@@ -193,6 +205,8 @@ class QueryProcess:
         traffic, starts = draw_traffic(fixed, self.config, for_traffic)
         for index in self.traffic.load(traffic):
             self.boundary.load(index)
+            if self.loops is not None:
+                self.loops.load(index)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
         self.start[episodes] = starts
         self.pending.reset(episodes)
@@ -202,6 +216,8 @@ class QueryProcess:
         self.boundary.reset(episodes)
         prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
         self.estimator.reset(episodes, prior, for_estimator)
+        if self._replay is not None:
+            self._replay.begin(episodes)
         self.queried[episodes] = False
         self.n_dropped[episodes] = 0
         self.age[episodes] = AGE_CAP
@@ -269,6 +285,8 @@ class QueryProcess:
         measured = self.measure(request)
         self.boundary.update(episodes, measured)
         self._threads.run(self.estimator.update, episodes, measured, Measurement.at)
+        if self._replay is not None:
+            self._replay.follow(episodes, traffic, self.time[episodes], inputs, measured)
         self.queried[own] = queried
         rows = slice(self.released.shape[1])
         answered = measured.observed[:, rows, None]

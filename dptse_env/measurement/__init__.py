@@ -1,7 +1,9 @@
-"""Inputs of the estimator: boundary inputs, errors of detectors, and answers put together."""
+"""Inputs of the estimator: boundary inputs, errors of detectors, loops, answers put together."""
 
 from dptse_env.measurement.boundary import BOUNDARIES, BoundaryModel, nominal_state
 from dptse_env.measurement.fusion import Fusion, FusionSettings
+from dptse_env.measurement.loops import LoopReadings
+from dptse_env.measurement.replay import Replay
 from dptse_env.measurement.sensors import DetectorErrors, Detectors, make_groups
 
 __all__ = [
@@ -11,6 +13,8 @@ __all__ = [
     "Detectors",
     "Fusion",
     "FusionSettings",
+    "LoopReadings",
+    "Replay",
     "make_groups",
     "nominal_state",
 ]

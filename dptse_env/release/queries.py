@@ -113,6 +113,12 @@ class Queries:
         channel = others if self.separate_sensors else self._singles | others
         return tuple(channel[s] for s in corridor.fixed_sensors)
 
+    def channels_of_segments(self, corridor: Corridor) -> IntArray:
+        """Return the channel of each segment (S,) by itself; needs queries of span 1."""
+        n, S = self.n_mainline, corridor.geometry.n_segments
+        on_ramps = range(self.n_queries, self.n_queries + S - n)
+        return np.array([*(self._singles[s] for s in range(n)), *on_ramps], dtype=np.int64)
+
     def others(self, corridor: Corridor) -> list[int]:
         """Return the segments of the road's channels that are no queries: ramps, then sensors.
 

@@ -15,8 +15,10 @@ from dptse_env.traffic.demand import (
 )
 from dptse_env.traffic.imported import ranges
 from dptse_env.traffic.library import RecordLibrary, Records, open_library
+from dptse_env.traffic.loops import Loops, Stations
 from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.traffic.penetration import Penetration
+from dptse_env.traffic.readings import readings
 from dptse_env.traffic.record import MOST_VEHICLES, InvalidRecordError, Record, average_dwell
 from dptse_env.traffic.recording import simulate_in_worker
 from dptse_env.traffic.roads import (
@@ -51,6 +53,7 @@ __all__ = [
     "Incident",
     "IncidentDistribution",
     "InvalidRecordError",
+    "Loops",
     "NetconvertError",
     "Penetration",
     "Record",
@@ -61,6 +64,7 @@ __all__ = [
     "RoadFile",
     "Scales",
     "Scenario",
+    "Stations",
     "SumoScenario",
     "SumoVersionError",
     "VehicleClass",
@@ -72,6 +76,7 @@ __all__ = [
     "ranges",
     "read_corridor",
     "read_road",
+    "readings",
     "road_name",
     "simulate",
     "simulate_in_worker",

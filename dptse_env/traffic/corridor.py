@@ -22,6 +22,7 @@ from dptse_env.traffic.demand import (
     IncidentDistribution,
     VehicleClass,
 )
+from dptse_env.traffic.loops import Loops
 from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.utils.files import json_digest
 from dptse_env.utils.units import HOUR
@@ -178,6 +179,7 @@ class Corridor:
         recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
             With recordings the demand is a description of them, and there is no incident.
         fixed_sensors: indices of the segments measured at every step.
+        loops: loop detectors at borders of segments; None for none.
         measured: names of fields of the parts, and of keywords of an environment, whose values were
             measured on the records of this road, as imports and ``dptse fit`` write down. They void
             a guarantee for the vehicles of these records.
@@ -194,6 +196,7 @@ class Corridor:
     sumo: SumoScenario | None = None
     recordings: Recordings | None = None
     fixed_sensors: tuple[Annotated[int, Interval(0, 2997)], ...] = ()
+    loops: Loops | None = None
     measured: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -205,6 +208,8 @@ class Corridor:
             integer(f"corridor.fixed_sensors[{i}]", sensor, 0, self.geometry.n_segments - 1)
         unique = len(set(self.fixed_sensors)) == len(self.fixed_sensors)
         require(unique, "corridor.fixed_sensors", "free of duplicates", self.fixed_sensors)
+        if self.loops is not None:
+            object.__setattr__(self, "loops", self.loops.at_borders(self.geometry))
         self._check_conditions()
         self._check_origin()
 

@@ -10,6 +10,7 @@ from dptse_env.traffic import (
     Demand,
     Drivers,
     Incident,
+    Loops,
     SumoScenario,
     VehicleClass,
 )
@@ -79,6 +80,7 @@ def test_the_digest_covers_what_shapes_the_traffic_and_nothing_else():
     observed = {
         "name": "other",
         "fixed_sensors": (14,),
+        "loops": Loops((0.0, 0.5)),
         "density_scale": 1.0,
         "speed_scale": 1.0,
         "average_dwell": 1.0,
