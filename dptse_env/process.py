@@ -170,7 +170,7 @@ class QueryProcess:
             raise RuntimeError("a process whose privacy.noise is 'secure' has no forks")
         shared = (
             self.config, self.interface, self.model, self.traffic, self._threads,
-            self.release.task, *self.boundary.shared, *(self.loops.shared if self.loops else ()),
+            self.release.task, *self.boundary.shared,
         )  # fmt: skip
         fork = copy.deepcopy(self, {id(item): item for item in shared})
         fork._is_fork = True
@@ -205,8 +205,6 @@ class QueryProcess:
         traffic, starts = draw_traffic(fixed, self.config, for_traffic)
         for index in self.traffic.load(traffic):
             self.boundary.load(index)
-            if self.loops is not None:
-                self.loops.load(index)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
         self.start[episodes] = starts
         self.pending.reset(episodes)

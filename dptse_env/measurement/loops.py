@@ -10,7 +10,7 @@ import numpy as np
 
 from dptse_env.estimators import Measurement
 from dptse_env.release import Task, Traffic
-from dptse_env.traffic import Stations, readings
+from dptse_env.traffic import Stations
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.units import HOUR
 
@@ -59,12 +59,9 @@ class LoopReadings:
         """Prepare for the loops of a task's corridor; nothing is loaded."""
         corridor = task.corridor
         assert corridor.loops is not None
-        self._loops, self._traffic, road = corridor.loops, traffic, corridor.road
+        self._traffic, road = traffic, corridor.road
         self.interval = corridor.loops.interval
         self.stations = Stations.of(corridor.loops, corridor.geometry, road)
-        shape = corridor.conditions.duration // self.interval, len(self.stations.lanes), 2
-        # np.empty takes address space, not memory, until traffic is loaded.
-        self._table = np.empty((len(traffic.seeds), *shape))
         segments = np.unique(self.stations.beside)
         self._channels = task.queries.channels_of_segments(corridor)[segments]
         self._releases_flow = task.releases_flow
@@ -74,18 +71,9 @@ class LoopReadings:
         beside: BoolArray = (self.stations.beside == segments[:, None, None]).any(axis=2)
         self._beside = beside.T.astype(np.float64)  # (F, L)
 
-    @property
-    def shared(self) -> tuple[FloatArray, ...]:
-        """The readings of all traffic, which no episode changes."""
-        return (self._table,)
-
-    def load(self, index: int) -> None:
-        """Make the readings of a traffic seed, whose record the traffic table has loaded."""
-        self._table[index] = readings(self._traffic.record(index), self.stations, self._loops)
-
     def read(self, traffic: IntArray, interval: IntArray) -> FloatArray:
         """Return readings (k, F, 2) of intervals, from 0 on, of traffic seeds by index, (k,)."""
-        found: FloatArray = self._table[traffic, interval]
+        found: FloatArray = self._traffic.readings[traffic, interval]
         return found
 
     def said(self, read: FloatArray) -> Said:

@@ -24,7 +24,15 @@ from numpy.typing import NDArray
 
 from dptse_env.model import Channels
 from dptse_env.release.noise import grid_of
-from dptse_env.traffic import MOST_VEHICLES, Corridor, Penetration, Record, RecordLibrary
+from dptse_env.traffic import (
+    MOST_VEHICLES,
+    Corridor,
+    Penetration,
+    Record,
+    RecordLibrary,
+    Stations,
+    readings,
+)
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, kernel
 from dptse_env.utils.validation import require
@@ -68,6 +76,8 @@ class Traffic:
         populations: Vehicles that each group of channels sees, None for all; none where vehicles
             are not read.
         n_vehicles: Vehicles of each record, shape (n_seeds,); 0 where vehicles are not read.
+        readings: What each of the F loops reports at the end of each interval, as
+            `dptse_env.traffic.readings` gives it, shape (n_seeds, K, F, 2).
     """
 
     def __init__(
@@ -92,6 +102,11 @@ class Traffic:
         self._cell: NDArray[np.int16] = np.empty(0, dtype=np.int16)
         self._speed: NDArray[np.float32] = np.empty((len(self.populations), 0), dtype=np.float32)
         self._n_rows = 0
+        self.readings: FloatArray = np.empty((len(seeds), 0, 0, 2))
+        if (loops := corridor.loops) is not None:
+            self._stations = Stations.of(loops, corridor.geometry, corridor.road)
+            shape = corridor.conditions.duration // loops.interval, len(self._stations.beside), 2
+            self.readings = np.empty((len(seeds), *shape))
 
     def load(self, indices: npt.ArrayLike) -> list[int]:
         """Load the records of some traffic seeds; return the indices that were not in memory.
@@ -109,6 +124,8 @@ class Traffic:
             self._table[index] = record.traffic(road.lengths, road.limits)
             if self.populations:
                 self._append(index, record)
+            if self.corridor.loops is not None:
+                self.readings[index] = readings(record, self._stations, self.corridor.loops)
             self._loaded[index] = True
         return new
 

@@ -25,3 +25,18 @@ def test_readings_tell_the_estimator_of_the_traffic():
     loops = {"positions": [0.0, 0.5, 1.0, 1.5], "interval": 20}
     road = {"corridor": {"fixed_sensors": []}, "estimator": "recurrent"}
     assert error(**road, loops=loops) < 0.8 * error(**road)
+
+
+def test_processes_that_share_loaded_traffic_read_the_same():
+    given = {"traffic_seeds": [0], "horizon": 60, "loops": {"positions": [0.3], "interval": 20}}
+    first = QueryProcess(resolve("short-highway", given))
+    second = QueryProcess(first.config, traffic=first.traffic)
+    assert first.traffic.load([0]) == [0]
+    for process in (first, second):
+        process.reset(np.arange(1), [np.random.default_rng(0)])
+    passed = first.traffic.readings[0, :, 0, 0]
+    assert passed.min() >= 0 < passed.max()
+    for _ in range(60):
+        for process in (first, second):
+            process.step(np.arange(1), np.ones((1, 6), dtype=np.int8))
+        np.testing.assert_array_equal(first.estimate.density, second.estimate.density)
