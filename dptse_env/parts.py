@@ -151,10 +151,16 @@ def privacy_report(config: EnvConfig) -> PrivacyReport:
 def complete_report(
     config: EnvConfig, release: ReleaseModel, boundary: BoundaryModel | type[BoundaryModel]
 ) -> PrivacyReport:
-    """Return a release model's report, voided where anything else depends on the traffic."""
+    """Return a release model's report, voided where anything else depends on the traffic.
+
+    Loops void nothing: the guarantee is one given what they show.
+    """
     shown = ("truth_in_info",) if config.truth_in_info else ()
     measured = ("measured_values",) if config.corridor.measured else ()
-    return release.report().voided((*boundary.void_reasons, *measured, *shown))
+    report, loops = release.report(), config.corridor.loops
+    if loops is not None:
+        report = report.beside(loops)
+    return report.voided((*boundary.void_reasons, *measured, *shown))
 
 
 def warn_where_void(config: EnvConfig) -> None:

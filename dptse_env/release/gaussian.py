@@ -27,7 +27,7 @@ from dptse_env.privacy import (
 from dptse_env.release.model import ReleaseModel, middle_speed
 from dptse_env.release.noise import Noise
 from dptse_env.release.report import PrivacyReport, QuantityReport, in_order
-from dptse_env.release.settings import CHANGES, BoundaryInputs, PrivacySettings
+from dptse_env.release.settings import CHANGES, BoundaryInputs, Change, PrivacySettings
 from dptse_env.release.task import Request, Task
 from dptse_env.release.vehicles import Ledgers, Terms, Traffic, require_exact_sums
 from dptse_env.traffic import Corridor
@@ -111,9 +111,10 @@ class GaussianRelease(ReleaseModel):
         """
 
     @property
-    def protected(self) -> str:
+    def protects(self) -> str:
         """Description of the protected data and of the change that is protected."""
-        return "one vehicle's trip, replaced by another"
+        change = Change("replaced by another", "replaced by others")
+        return self.task.protects("one vehicle's trip", change)
 
     @property
     def sigma(self) -> FloatArray:
@@ -157,7 +158,7 @@ class GaussianRelease(ReleaseModel):
         # Le Ny's kappa may be so loose that even both releases together stay below epsilon.
         if epsilon > settings.epsilon * (1.0 + 1e-9):
             found.append("releases_not_composed")
-        protects = task.protects(self.protected)
+        protects = self.protects
         quantities = " and ".join(release.quantity for release in sensitivity.releases)
         return replace(
             super().report(),
@@ -297,11 +298,10 @@ class CappedSettings(PrivacySettings):
 
     @property
     def protected(self) -> str:
-        """Description of the protected data and of the change that is protected."""
-        change = CHANGES[self.adjacency]
+        """Description of the protected data."""
         if self.unit == "trip":
-            return f"one vehicle's trip, which counts in {self.cap} queried steps, {change}"
-        return f"one second of one vehicle's trip, {change}"
+            return f"one vehicle's trip, which counts in {self.cap} queried steps"
+        return "one second of one vehicle's trip"
 
 
 class Capped(GaussianRelease):
@@ -347,10 +347,10 @@ class Capped(GaussianRelease):
         return tuple(factor * std for std in noise)
 
     @property
-    def protected(self) -> str:
-        """See `GaussianRelease.protected`."""
-        described: str = self.task.settings.protected
-        return described
+    def protects(self) -> str:
+        """See `GaussianRelease.protects`."""
+        settings = self.task.settings
+        return self.task.protects(settings.protected, CHANGES[settings.adjacency])
 
     def _details(self) -> Mapping[str, Any]:
         settings = self.task.settings

@@ -76,9 +76,8 @@ class PacedSettings(PrivacySettings):
 
     @property
     def protected(self) -> str:
-        """Description of the protected data and of the change that is protected."""
-        part = "whole trip" if self.unit == "trip" else "second of a trip"
-        return f"one vehicle's {part}, {CHANGES[self.adjacency]}"
+        """Description of the protected data."""
+        return f"one vehicle's {'whole trip' if self.unit == 'trip' else 'second of a trip'}"
 
 
 class Paced(ReleaseModel):
@@ -231,7 +230,7 @@ class Paced(ReleaseModel):
     def report(self) -> PrivacyReport:
         """See `ReleaseModel.report`."""
         task, settings, mu = self.task, self.task.settings, self._epsilons.mu
-        protects = task.protects(settings.protected)
+        protects = task.protects(settings.protected, CHANGES[settings.adjacency])
         return replace(
             super().report(),
             guarantee=settings.guarantee(mu, "count and flow", protects),

@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
+from dptse_env.traffic import Loops
+
 VOID_REASONS: Mapping[str, str] = MappingProxyType(
     {
         "not_stated": "the release model states no guarantee",
@@ -42,6 +44,12 @@ VOID_REASONS: Mapping[str, str] = MappingProxyType(
     }
 )
 """Reasons against a guarantee with an explanation each, in the order of reports."""
+
+GIVEN_LOOPS = "given the counts and speeds of the loops, which are public and not protected"
+"""Condition of a guarantee beside loops."""
+
+ALONE = "a vehicle alone in an interval shows its speed there, as loops.least_count is below 2"
+"""Warning of readings of a single vehicle."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +96,8 @@ class PrivacyReport:
         epsilons: Epsilon of all releases together at further deltas, from ``"1e-2"`` to ``"1e-6"``.
         releases: A report for each released quantity.
         assumptions: The public numbers the sensitivities were computed from, by name with unit.
-        details: Settings of this release model alone, such as unit, cap, adjacency and share.
+        details: Settings of this release model alone, such as unit, cap, adjacency and share; and
+            ``loops``, where there are any.
     """
 
     preset: str
@@ -106,6 +115,17 @@ class PrivacyReport:
     releases: tuple[QuantityReport, ...] = ()
     assumptions: Mapping[str, float] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    def beside(self, loops: Loops) -> PrivacyReport:
+        """Return what the report states beside loops: the same, given their readings."""
+        alone = f"; {ALONE}" if loops.least_count < 2 else ""
+        named = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(loops).items()}
+        return replace(
+            self,
+            protects=f"{self.protects}, {GIVEN_LOOPS}{alone}",
+            guarantee="none" if self.guarantee == "none" else f"{self.guarantee}, {GIVEN_LOOPS}",
+            details={**self.details, "loops": named},
+        )
 
     def voided(self, reasons: Iterable[str]) -> PrivacyReport:
         """Return the report with further reasons against a guarantee."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from dptse_env.privacy import Adjacency, rounded_up
 from dptse_env.release.noise import NoiseSource
@@ -13,11 +13,26 @@ BoundaryInputs = Literal["true", "nominal", "private"]
 """Source of the estimator's inputs at the boundary: measured traffic, public demand, or the
 boundary segments' releases."""
 
-CHANGES: dict[Adjacency, str] = {
-    "replace": "replaced by any other, connected or not, or by none",
-    "add_remove": "added or removed",
+
+class Change(NamedTuple):
+    """Change of a vehicle's data between two adjacent records, in words.
+
+    Attributes:
+        rows: That of all of its data.
+        reports: That of what it reports, where loops count it exactly whatever it reports.
+    """
+
+    rows: str
+    reports: str
+
+
+CHANGES: dict[Adjacency, Change] = {
+    "replace": Change(
+        "replaced by any other, connected or not, or by none", "replaced by others or left out"
+    ),
+    "add_remove": Change("added or removed", "added or left out"),
 }
-"""Change of a vehicle's data between two adjacent records, in words."""
+"""Change of each adjacency."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dptse_env.estimators import Estimate
 from dptse_env.model import Channels
 from dptse_env.release.queries import Queries
+from dptse_env.release.settings import Change
 from dptse_env.traffic import Corridor, Penetration
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
@@ -148,11 +149,18 @@ class Task:
         """Part of the budget mu^2 of each group, shape (groups,)."""
         return np.array([group.budget_share for group in self.groups])
 
-    def protects(self, what: str) -> str:
-        """Return what a release protects, in words: a vehicle that all groups see."""
-        if self.is_whole:
-            return what
-        return f"a connected vehicle: {what}, under queries and fixed sensors together"
+    def protects(self, what: str, change: Change) -> str:
+        """Return what a release protects, in words: of a vehicle that all groups see.
+
+        Beside loops it is what the vehicle reports: they count it, whatever that is.
+        """
+        has_loops = self.corridor.loops is not None
+        protected = f"{what}, {change.reports if has_loops else change.rows}"
+        if not self.is_whole:
+            protected += ", under queries and fixed sensors together"
+        if has_loops:
+            return f"the reports of a connected vehicle: {protected}"
+        return protected if self.is_whole else f"a connected vehicle: {protected}"
 
     def group_reports(self, mu: FloatArray, noise_std: FloatArray) -> dict[str, Any]:
         """Return ``groups`` for the details of a report; nothing where all channels are one group.

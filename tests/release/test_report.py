@@ -3,11 +3,12 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 
 from dptse_env.config import resolve
 from dptse_env.parts import privacy_report
-from dptse_env.release import VOID_REASONS
+from dptse_env.release import VOID_REASONS, ReleaseModel
 from dptse_env.release.report import in_order
 
 OWN = {
@@ -52,6 +53,108 @@ def test_whatever_else_depends_on_the_traffic_voids_a_guarantee(keywords, reason
     assert found.void_reasons == reasons
     assert (found.guarantee == "none") == bool(reasons)
     assert found.voided(["own"]).void_reasons == (*reasons, "own")
+
+
+WHOLE, PARTLY, EVENT = {}, {"penetration": 0.1}, {"unit": "event", "adjacency": "add_remove"}
+TRIP, CAPPED = "one vehicle's whole trip", "one vehicle's trip, which counts in 64 queried steps"
+TOGETHER = "under queries and fixed sensors together"
+PROTECTED = [
+    ("paced", WHOLE, f"{TRIP}, replaced by any other, connected or not, or by none"),
+    (
+        "paced",
+        PARTLY,
+        f"a connected vehicle: {TRIP}, replaced by any other, connected or not, or by none, "
+        f"{TOGETHER}",
+    ),
+    ("capped", WHOLE, f"{CAPPED}, replaced by any other, connected or not, or by none"),
+    (
+        {"preset": "capped", **EVENT},
+        WHOLE,
+        "one second of one vehicle's trip, added or removed",
+    ),
+    ({"preset": "paced", **EVENT}, WHOLE, "one vehicle's second of a trip, added or removed"),
+    (
+        "printed",
+        PARTLY,
+        f"a connected vehicle: one vehicle's trip, replaced by another, {TOGETHER}",
+    ),
+]
+
+
+@pytest.mark.parametrize(("privacy", "keywords", "protects"), PROTECTED)
+def test_without_loops_a_report_protects_presence_and_names_no_loops(privacy, keywords, protects):
+    found = privacy_report(resolve("private-highway", {"privacy": privacy, **keywords})).to_dict()
+    assert found["protects"] == protects
+    assert "loops" not in str(found)
+
+
+GIVEN = ", given the counts and speeds of the loops, which are public and not protected"
+ALONE = "; a vehicle alone in an interval shows its speed there, as loops.least_count is below 2"
+CHANGES = {
+    "replaced by any other, connected or not, or by none": "replaced by others or left out",
+    "replaced by another": "replaced by others",
+    "added or removed": "added or left out",
+}
+
+
+@pytest.mark.parametrize(("privacy", "keywords", "protects"), PROTECTED)
+@pytest.mark.parametrize("least_count", [0, 2])
+def test_beside_loops_a_report_protects_reports_given_the_readings(
+    privacy, keywords, protects, least_count
+):
+    """All numbers stay: nothing is paid for a loop, and nothing is kept for it."""
+    loops = {"positions": [0.5, 1.0], "interval": 60, "least_count": least_count}
+    without, beside = (
+        privacy_report(resolve("private-highway", {"privacy": privacy, **keywords, **more}))
+        for more in ({}, {"loops": loops})
+    )
+    without, beside = without.to_dict(), beside.to_dict()
+    assert json.loads(json.dumps(beside)) == beside
+    for rows, reports in CHANGES.items():
+        protects = protects.replace(rows, reports)
+    reports = (
+        f"the reports of a connected vehicle: {protects.removeprefix('a connected vehicle: ')}"
+    )
+    assert beside.pop("protects") == reports + GIVEN + (ALONE if least_count < 2 else "")
+    assert beside.pop("loops") == {**loops, "ramps": []}
+    claims = without.pop("guarantee"), beside.pop("guarantee")
+    if claims[0] == "none":
+        assert claims[1] == "none"
+    else:
+        assert claims[1] == claims[0].replace(without["protects"], reports) + GIVEN
+        assert "none" not in claims[1]
+    del without["protects"]
+    assert beside == without
+
+
+class Claims(ReleaseModel):
+    """States a guarantee of its own."""
+
+    sigma = np.ones(2)
+
+    def reset(self, episodes, generators):
+        """Nothing to begin."""
+
+    def release(self, request):
+        """Never called."""
+
+    def report(self):
+        own = {"guarantee": "a claim", "protects": "a trip", "void_reasons": ()}
+        return dataclasses.replace(super().report(), **own)
+
+
+def test_the_claim_of_a_foreign_model_is_conditional_on_loops_too():
+    found = privacy_report(
+        resolve(
+            "short-highway",
+            {
+                "privacy": {"preset": Claims, "boundary_inputs": "nominal"},
+                "loops": {"positions": [0.3], "least_count": 5},
+            },
+        )
+    )
+    assert (found.guarantee, found.protects) == ("a claim" + GIVEN, "a trip" + GIVEN)
+    assert found.void_reasons == ()
 
 
 def test_reasons_come_in_the_order_of_the_table_and_unknown_ones_last():
