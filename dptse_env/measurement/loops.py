@@ -61,7 +61,7 @@ class LoopReadings:
         assert corridor.loops is not None
         self._traffic, road = traffic, corridor.road
         self.interval = corridor.loops.interval
-        self.stations = Stations.of(corridor.loops, corridor.geometry, road)
+        self.stations = Stations.of(corridor.loops, corridor.geometry)
         segments = np.unique(self.stations.beside)
         self._channels = task.queries.channels_of_segments(corridor)[segments]
         self._releases_flow = task.releases_flow
@@ -77,19 +77,19 @@ class LoopReadings:
         return found
 
     def said(self, read: FloatArray) -> Said:
-        """Return what readings (k, F, 2) say: density q / v, by lane, and speed.
+        """Return what readings (k, F, 2) say: density q / v and speed.
 
         A segment between two stations has the mean of both.
         """
         count, speed = read[..., 0], read[..., 1]
-        flow = count * (HOUR / self.interval) / self.stations.lanes  # [veh/h] of a lane
+        flow = count * (HOUR / self.interval)  # [veh/h]
         density = np.where(count > 0.0, flow / np.maximum(speed, LEAST_SPEED), 0.0)
         density_std, speed_std = deviations(speed)
         density_std = np.where(count > 0.0, density_std, NOTHING_PASSED)
         known, passed = np.isfinite(count), count > 0.0
         speed, speed_std = self._mean(speed, passed), self._mean(speed_std, passed)
         return Said(
-            self._lanes * self._mean(density, known),
+            self._mean(density, known),
             np.where(np.isfinite(speed), speed, self._limit),
             self._lanes * self._mean(density_std, known),
             np.where(np.isfinite(speed_std), speed_std, UNKNOWN),

@@ -104,7 +104,7 @@ class Traffic:
         self._n_rows = 0
         self.readings: FloatArray = np.empty((len(seeds), 0, 0, 2))
         if (loops := corridor.loops) is not None:
-            self._stations = Stations.of(loops, corridor.geometry, corridor.road)
+            self._stations = Stations.of(loops, corridor.geometry)
             shape = corridor.conditions.duration // loops.interval, len(self._stations.beside), 2
             self.readings = np.empty((len(seeds), *shape))
 

@@ -11,7 +11,6 @@ from typing import Annotated, NamedTuple, Self
 import numpy as np
 
 from dptse_env.geometry import Face, Geometry
-from dptse_env.road import Road
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.validation import Interval, checked_fields, require
 
@@ -28,9 +27,9 @@ class Loops:
 
     Attributes:
         positions: of stations on the mainline, from its upstream end [km], increasing. One within
-            a segment is moved to the nearest border. Where a ramp meets the mainline a station
-            counts the vehicles that stay on the mainline.
-        ramps: faces of ramps with a station, where they meet the mainline.
+            a segment is moved to the nearest border. A station counts who enters the segment behind
+            its border: those of an on-ramp there, too, and not who leaves by an off-ramp.
+        ramps: faces of ramps with a station, which counts who passes between ramp and mainline.
         interval: length of an interval [s].
         least_count: number of vehicles below which an interval reports nothing. A vehicle that
             passes alone shows its speed.
@@ -100,35 +99,55 @@ def borders_of(geometry: Geometry) -> FloatArray:
 class Stations(NamedTuple):
     """The F stations of a road, those of the mainline first.
 
-    A vehicle passes a station where it leaves one of its `upstream` cells for one of its
-    `downstream` cells.
+    A station on the mainline counts who comes over its border into the segment behind it: at a face
+    with an on-ramp also who comes from the ramp, at one with an off-ramp not who leaves by it. At
+    the downstream end it counts who leaves the mainline. A station on a ramp counts who passes
+    between ramp and mainline.
+
+    A vehicle passes a station where it comes from a cell of `upstream` to one of `downstream`.
     """
 
     upstream: BoolArray  # (F, cells) flags
     downstream: BoolArray  # (F, cells) flags
-    beside: IntArray  # (F, 2) segments before and after; one stands twice where the road ends
-    lanes: FloatArray  # (F,) of the road there
+    beside: IntArray  # (F, 2) segments with the same flow; one stands twice where it is alone
+    enters: IntArray  # (F,) the first segment where vehicles come into the road, -1 elsewhere
+    leaves: IntArray  # (F,) the last segment where they leave it, -1 elsewhere
 
     @classmethod
-    def of(cls, loops: Loops, geometry: Geometry, road: Road) -> Self:
+    def of(cls, loops: Loops, geometry: Geometry) -> Self:
         """Return the stations of loops at borders."""
-        n, S = geometry.n_mainline, geometry.n_segments
-        place = np.full(geometry.n_cells, -2)
-        place[:n], place[S], place[S + 1] = np.arange(n), -1, n
-        on_mainline, upstream, downstream, beside = place > -2, [], [], []
-        for face in loops.faces(geometry).tolist():
-            upstream.append(on_mainline & (place < face))
-            downstream.append(on_mainline & (place >= face))
-            beside.append((max(face - 1, 0), min(face, n - 1)))
+        n, S, cells = geometry.n_mainline, geometry.n_segments, geometry.n_cells
+        # Mainline faces up to these lie behind a cell, and those from there on ahead of it.
+        behind, ahead = np.full(cells, -1), np.full(cells, n + 1)
+        behind[:n] = np.arange(n)
+        ahead[:n] = behind[:n] + 1
+        ahead[S], behind[S + 1] = 0, n
+        ramps = []
         for ramp, (face, _, segments) in enumerate(geometry.ramps()):
-            if face not in loops.ramps:
-                continue
-            own = np.zeros(geometry.n_cells, dtype=bool)
+            own = np.zeros(cells, dtype=bool)
             own[[*segments, S + 2 + ramp]] = True
             is_on_ramp = ramp < len(geometry.on_ramps)
-            upstream.append(own if is_on_ramp else on_mainline)
-            downstream.append(on_mainline if is_on_ramp else own)
-            end = segments[-1] if is_on_ramp else segments[0]
+            # Nobody drives back onto a ramp, or from an off-ramp onto the road.
+            (ahead if is_on_ramp else behind)[own] = face if is_on_ramp else face - 1
+            if face in loops.ramps:
+                ramps.append((face, own, is_on_ramp, segments[-1 if is_on_ramp else 0]))
+        upstream, downstream, beside = [], [], []
+        faces = loops.faces(geometry).tolist()
+        for face in faces:
+            upstream.append(ahead <= face)
+            downstream.append(behind >= face)
+            after = min(face, n - 1)
+            alone = face == 0 or face in (*geometry.on_ramps, *geometry.off_ramps)
+            beside.append((after if alone else face - 1, after))
+        for face, own, is_on_ramp, end in ramps:
+            upstream.append(own if is_on_ramp else ahead <= face)
+            downstream.append(behind >= face if is_on_ramp else own)
             beside.append((end, end))
-        pairs = np.array(beside, dtype=np.int64).reshape(-1, 2)
-        return cls(np.array(upstream), np.array(downstream), pairs, road.lanes[pairs].min(axis=1))
+        ends = np.array([*faces, *(-1 for _ in ramps)])
+        return cls(
+            np.array(upstream),
+            np.array(downstream),
+            np.array(beside, dtype=np.int64).reshape(-1, 2),
+            np.where(ends == 0, 0, -1),
+            np.where(ends == n, n - 1, -1),
+        )
