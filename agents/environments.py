@@ -17,6 +17,7 @@ from dptse_env.evaluation import require_in_step
 from dptse_env.privacy import rounded_up
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.release import RELEASE_MODELS
+from dptse_env.traffic import Loops
 from dptse_env.utils.validation import parse_json, require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
@@ -133,6 +134,8 @@ def heading(env: str, keywords: Mapping[str, Any]) -> str:
             said += _differences("corridor", road.fields(), own.fields())
     else:
         said += _differences("corridor", road.fields(), default.corridor.fields())
+    if road.loops != default.corridor.loops:
+        said.append(f"loops {_in_words(road.loops)}")
     expected = RELEASE_MODELS.find(privacy.preset).settings_type(
         preset=privacy.preset, epsilon=privacy.epsilon, delta=privacy.delta
     )
@@ -147,11 +150,23 @@ def heading(env: str, keywords: Mapping[str, Any]) -> str:
     return ", ".join(said)
 
 
+def _in_words(loops: Loops | None) -> str:
+    """Return stations, interval and least count; of many stations their number."""
+    if loops is None:
+        return "none"
+    stations = [f"{each:g} km" for each in loops.positions] + [f"ramp {r}" for r in loops.ramps]
+    words = ", ".join(stations)
+    if len(words) > LONGEST:
+        words = f"{len(stations)} stations"
+    least = f" (least count {loops.least_count})" if loops.least_count else ""
+    return f"at {words} every {loops.interval} s{least}"
+
+
 def _differences(path: str, own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """Return the values that differ from others, by path; of long ones the path alone."""
     found = []
     for name, value in own.items():
-        if value != other.get(name):
+        if name != "loops" and value != other.get(name):
             words = getattr(value, "__name__", str(value))
             place = f"{path}.{name}" if path else name
             found.append(f"{place} {words}" if len(words) <= LONGEST else f"another {place}")

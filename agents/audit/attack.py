@@ -18,6 +18,7 @@ from dptse_env.parts import make_release, make_traffic
 from dptse_env.process import QueryProcess
 from dptse_env.release import GaussianRelease, ReleaseModel, Request
 from dptse_env.release.noise import Noise
+from dptse_env.traffic import Stations, readings
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 BATCH = 250
@@ -59,6 +60,7 @@ class Overheard(ReleaseModel):
     He knows both worlds and all that is public. To each second he finds out what either world
     would have released without noise: by the same release model, given the run's own queries and
     predictions. What was released he scores by the likelihood ratio of Gaussians of either mean.
+    Loops report the same in both worlds, whose vehicles differ in what they report.
 
     Attributes:
         model: The release model.
@@ -81,6 +83,11 @@ class Overheard(ReleaseModel):
         """
         traffic = make_traffic(config, worlds)
         traffic.load(np.arange(len(worlds.pairs)))
+        corridor = config.corridor
+        if corridor.loops is not None:
+            # The guarantee is one given the readings: worlds differ in reports, not in what drives.
+            stations = Stations.of(corridor.loops, corridor.geometry, corridor.road)
+            traffic.readings[:] = readings(worlds.rest, stations, corridor.loops)
         self.model = make_release(config, n, traffic)
         super().__init__(self.model.task, traffic)
         # Every run in both worlds, whichever it is in.

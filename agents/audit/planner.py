@@ -224,6 +224,8 @@ class Planner:
                 np.add.at(total, vehicle.step, np.sum(self.moves(rest, vehicle) ** 2, axis=1))
             best = int(np.argmax(total))
             pair = pair[0].only(pair[0].step == best), pair[1].only(pair[1].step == best)
+        if self.config.corridor.loops is not None:
+            description = f"the reports of {description}"
         return Worlds.adjacent(rest, pair, description)
 
     def _reached(self, worlds: Worlds) -> float:

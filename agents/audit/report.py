@@ -96,6 +96,11 @@ class Finding:
                 'only the releases were attacked: boundary_inputs is "true", so the estimates use '
                 "the true traffic at the boundary, and their epsilon is infinite"
             )
+        if "loops" in self.privacy.details:
+            lines.append(
+                "only reports were replaced or left out: loops count the other vehicles alone, in "
+                "both worlds alike; what they show is public, and no guarantee covers it"
+            )
         verdict = f"verdict: {self.verdict}, at confidence {result.confidence:.0%}"
         return [table, *lines, verdict]
 

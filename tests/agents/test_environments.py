@@ -31,6 +31,15 @@ def test_the_heading_of_an_id_has_parameters_and_losses_alone():
         ('{"parameters": "published"}', "parameters published"),
         ('{"horizon": 300}', "horizon 300"),
         ('{"incident": "none"}', "corridor.incident None"),
+        ('{"loops": {"positions": [0, 0.5]}}', "loops at 0 km, 0.5 km every 20 s"),
+        (
+            '{"loops": {"ramps": [3], "interval": 60, "least_count": 5}}',
+            "loops at ramp 3 every 60 s (least count 5)",
+        ),
+        (
+            '{"corridor": "short-highway", "bandwidth": 2, "loops": {"positions": [0.3]}}',
+            "loops at 0.3 km every 20 s",
+        ),
         ('{"demand": {"base": {"mainline": [[0, 900]]}}}', "another corridor.demand"),
         (
             '{"corridor": "short-highway", "bandwidth": 2}',
