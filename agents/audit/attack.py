@@ -86,7 +86,7 @@ class Overheard(ReleaseModel):
         corridor = config.corridor
         if corridor.loops is not None:
             # The guarantee is one given the readings: worlds differ in reports, not in what drives.
-            stations = Stations.of(corridor.loops, corridor.geometry, corridor.road)
+            stations = Stations.of(corridor.loops, corridor.geometry)
             traffic.readings[:] = readings(worlds.rest, stations, corridor.loops)
         self.model = make_release(config, n, traffic)
         super().__init__(self.model.task, traffic)

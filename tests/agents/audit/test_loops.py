@@ -23,7 +23,7 @@ def beside_loops(setting):
 
 def passing(record):
     """Worlds with and without a vehicle that passes the loop."""
-    stations = Stations.of(ROAD.loops, ROAD.geometry, ROAD.road)
+    stations = Stations.of(ROAD.loops, ROAD.geometry)
     table = readings(record, stations, ROAD.loops)
     for vehicle in range(record.n_vehicles):
         rest = record.without(vehicle)
