@@ -140,12 +140,27 @@ def read_tensors(
             raise ValueError("it is not a regular file")
         if status.st_size > largest:
             raise ValueError(f"it must have at most {largest} bytes, got {status.st_size}")
-        return _parsed(Path(path).read_bytes())
+        content = Path(path).read_bytes()
+    except ValueError as problem:
+        raise _damaged(os.fspath(path), problem) from problem
+    return parse_tensors(content, os.fspath(path))
+
+
+def parse_tensors(content: bytes, name: str) -> tuple[dict[str, Any], dict[str, AnyArray]]:
+    """Return what `read_tensors` returns of the content of such a file, `name` in messages.
+
+    Raises:
+        ValueError: It is no such content, is damaged, or exceeds a limit of this module.
+    """
+    try:
+        return _parsed(content)
     except (ValueError, SafetensorError, LookupError, RecursionError) as problem:
-        reason = " ".join(str(problem).split())
-        raise ValueError(
-            f"{os.fspath(path)} is damaged, or no safetensors file with a card: {reason:.300}"
-        ) from problem
+        raise _damaged(name, problem) from problem
+
+
+def _damaged(name: str, problem: Exception) -> ValueError:
+    reason = " ".join(str(problem).split())
+    return ValueError(f"{name} is damaged, or no safetensors file with a card: {reason:.300}")
 
 
 def write_tensors(
@@ -166,19 +181,33 @@ def write_tensors(
         OSError: It cannot be written; what was there stays.
         ValueError: `read_tensors` would refuse the file; what was there stays.
     """
+    write_atomically(path, dump_tensors(arrays, card, os.fspath(path), largest))
+
+
+def dump_tensors(
+    arrays: Mapping[str, AnyArray],
+    card: Mapping[str, Any],
+    name: str,
+    largest: int = LARGEST_FILE,
+) -> bytes:
+    """Return what `write_tensors` writes, `name` in messages.
+
+    Raises:
+        ValueError: `parse_tensors` would refuse it, or it is too large.
+    """
     stored = {
-        name: np.asarray(array, array.dtype.newbyteorder("<"), order="C")
-        for name, array in arrays.items()
+        key: np.asarray(array, array.dtype.newbyteorder("<"), order="C")
+        for key, array in arrays.items()
     }
     try:
         signed = {**card, _DIGEST: content_digest(card, stored)}
-        content = save(stored, {"card": _text(signed)})
+        content: bytes = save(stored, {"card": _text(signed)})
         if len(content) > largest:
             raise ValueError(f"it would have {len(content)} bytes, more than {largest}")
         _parsed(content)
     except (TypeError, ValueError, SafetensorError, RecursionError) as problem:
-        raise ValueError(f"{os.fspath(path)} cannot be written: {problem!s:.300}") from problem
-    write_atomically(path, content)
+        raise ValueError(f"{name} cannot be written: {problem!s:.300}") from problem
+    return content
 
 
 def require_arrays(
