@@ -10,8 +10,11 @@ The module prefix makes the id known in subprocesses too. `evaluate` plays whole
 query policy::
 
     rows = dptse_env.evaluate(env, "shift-ahead", seeds=range(64))
+
+`RoadEstimator` runs an estimator on a stream of one's own.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from dptse_env.registration import register_environments, register_part
@@ -19,16 +22,35 @@ from dptse_env.versions import __version__
 
 if TYPE_CHECKING:
     from dptse_env.evaluation import evaluate
+    from dptse_env.measurement.seen import Seen, probes, station
+    from dptse_env.road_estimator import RoadEstimator
 
-__all__ = ["__version__", "evaluate", "register_environments", "register_part"]
+__all__ = [
+    "RoadEstimator",
+    "Seen",
+    "__version__",
+    "evaluate",
+    "probes",
+    "register_environments",
+    "register_part",
+    "station",
+]
 
 register_environments()
 
 
-def __getattr__(name: str) -> Any:
-    """Import `evaluate` at its first use: registering ids is quick, environments are not."""
-    if name == "evaluate":
-        from dptse_env.evaluation import evaluate  # noqa: PLC0415
+_LATER = {
+    "RoadEstimator": "road_estimator",
+    "Seen": "measurement.seen",
+    "evaluate": "evaluation",
+    "probes": "measurement.seen",
+    "station": "measurement.seen",
+}
+"""Modules of what is imported at its first use: registering ids is quick, environments are not."""
 
-        return evaluate
+
+def __getattr__(name: str) -> Any:
+    """Import what `_LATER` names."""
+    if name in _LATER:
+        return getattr(import_module(f"dptse_env.{_LATER[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,342 @@
+"""An estimator on a road, with whatever its sensors say: a door for a stream of one's own.
+
+A reading of an interval counts in every second of it. The estimator keeps some of its past states,
+and goes back to the interval's beginning and forward again, so that readings of a second or of ten
+minutes, in time or late, are one case. Sources of the same second and segment are put together by
+their variances. What nobody saw is as predicted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dptse_env.config import resolve
+from dptse_env.estimators import Estimate, Measurement, make_estimator
+from dptse_env.geometry import Geometry
+from dptse_env.measurement import nominal_state
+from dptse_env.measurement.boundary import nominal_inputs
+from dptse_env.measurement.loops import UNKNOWN
+from dptse_env.measurement.seen import LONGEST, Seen
+from dptse_env.parts import make_model
+from dptse_env.traffic.loops import TOLERANCE
+from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
+from dptse_env.utils.files import dump_tensors, json_digest, parse_tensors, require_arrays
+from dptse_env.utils.registry import name_of_class
+from dptse_env.utils.validation import convert, integer, require, within
+from dptse_env.versions import code_version, numbers_of
+
+FORMAT = "road-estimator-1"
+"""Name of the layout of a saved state; another one is refused."""
+LARGEST_STATE = 2**30
+"""Largest size of a saved state [bytes]."""
+
+SPACING = 8
+"""The state of second t is kept for this many times the largest power of two in t, so that to go
+back costs an eighth of the way at most."""
+N_ROWS = 768
+"""Seconds of the stream that are kept. States that are gone back to are 727 s old at most."""
+ALIKE = 9.0
+LATEST = 2**40
+"""Largest second of a clock, and minus the smallest one."""
+
+_ONE = np.array([0])
+_NO_QUERIES = {
+    "privacy": "corrected", "penetration": 1.0, "detectors": {}, "query_spans": (1,),
+    "bandwidth": 1,
+}  # fmt: skip
+"""Keywords that a road file may have for queries, which nobody asks here."""
+
+
+class Entry(NamedTuple):
+    """What a source adds to the stream."""
+
+    before: int  # the second before its interval, or before what can still change
+    until: int
+    segments: slice
+    added: FloatArray  # (2, 2) weights 1 / std^2 and weighted values, of density and speed
+
+
+class RoadEstimator:
+    """An estimator on a road, second by second, from whatever came in.
+
+    Ends of the road and of its ramps have the traffic that sources beside them said last, within
+    ten minutes. Where none did, vehicles enter at the demand that the road file publishes, whose
+    first second is the stream's and whose last one goes on, and behind exits it is as before them.
+
+    Attributes:
+        corridor: The road.
+        model: Its traffic model.
+        time: The present second.
+    """
+
+    def __init__(
+        self,
+        road: Any,
+        estimator: Any = "recurrent",
+        *,
+        stations: Sequence[float] = (),
+        start: int = 0,
+        parameters: Any = None,
+        estimator_settings: Any = None,
+    ) -> None:
+        """Begin with free traffic, at the demand that the road file publishes.
+
+        Args:
+            road: A road file, the name of a road, or a `Corridor`.
+            estimator: See the keyword of an environment.
+            stations: Places of stations on the mainline [km], increasing. Without settings, `asm`
+                smooths over half of their mean distance, .1 km at least.
+            start: The present second, on the clock of the stream.
+            parameters: See the keyword of an environment.
+            estimator_settings: See the keyword of an environment.
+
+        Raises:
+            ValueError: A value is out of range, or the estimator does not say what it remembers.
+
+        Warns:
+            UserWarning: Values that were measured or tuned on other roads are used.
+        """
+        given = {"parameters": parameters, "estimator_settings": estimator_settings}
+        given = {name: value for name, value in given.items() if value is not None}
+        keywords = {**_NO_QUERIES, "corridor": road, "estimator": estimator, **given}
+        config = resolve("private-highway", keywords)
+        self.corridor, self.model = config.corridor, make_model(config)
+        self._borders = dict(_borders(self.corridor.geometry))
+        settings = config.settings()
+        distance = self._distance(stations)
+        if distance > 0.0 and "estimator_settings" not in given and hasattr(settings, "asm"):
+            own = dataclasses.replace(settings.asm, length=min(max(0.5 * distance, 0.1), 1.0))
+            settings = dataclasses.replace(settings, asm=own)
+        self._estimator = make_estimator(estimator, "compiled", self.model, 1, settings)
+        self.time = self._start = integer("start", start, -LATEST, LATEST)
+        self._made_of = {
+            "road": json_digest([repr(self.corridor.geometry), self.corridor.digest]),
+            "estimator": name_of_class(type(self._estimator)),
+            "settings": json_digest([repr(settings), repr(config.parameters)]),
+        }
+        self._demand = nominal_inputs(self.corridor, self.model)
+        # What was said last beside the R boundary segments: density, speed, second; never yet.
+        self._ends = np.zeros((1, self.model.n_boundaries, 3))
+        self._ends[..., 2] = -np.finfo(float).max
+        self._stream = np.zeros((N_ROWS, self.model.n_segments, 2, 2))
+        prior = nominal_state(self.corridor, self.model, np.array([0]))
+        self._estimator.reset(_ONE, prior, [np.random.default_rng(0)])
+        self._kept = {self.time: self._copies()}
+        self._estimates = {self.time: self._estimator.estimate()}
+
+    def step(self, seen: Iterable[Seen] = (), seconds: int = 1) -> None:
+        """Go on, and take what came in.
+
+        Args:
+            seen: What sources said: results of `station`, `probes` and `Seen`.
+            seconds: Seconds to go on by, of which a gap has many.
+
+        Raises:
+            ValueError: A place is not on the road, or an interval ended more than ten minutes ago,
+                ends in the future, or ended before the stream began. Nothing has changed then.
+
+        Warns:
+            UserWarning: A point lies within a segment and counts at its border.
+        """
+        now = self.time + integer("seconds", seconds, 1, 10**7)
+        integer("time", now, -LATEST, LATEST)
+        is_sequence = isinstance(seen, Iterable) and not isinstance(seen, str | bytes)
+        require(is_sequence, "seen", "a sequence of what station() and others return", seen)
+        entries = [self._entry(f"seen[{i}]", each, now) for i, each in enumerate(seen)]
+        while now - self.time > LONGEST:
+            self._go_on(self.time + LONGEST, [])
+        self._go_on(now, entries)
+
+    def estimate(self, delay: int = 0) -> Estimate:
+        """Return density [veh/km] and speed [km/h] of every segment, and deviations, (S,) each.
+
+        Args:
+            delay: Seconds before the present, for an estimate of then by what is known now.
+
+        Raises:
+            ValueError: It is longer than ten minutes, or than the stream.
+        """
+        longest = min(LONGEST, self.time - self._start)
+        found = self._estimates[self.time - integer("delay", delay, 0, longest)]
+        return Estimate(*(array[0].copy() for array in found))
+
+    def save(self) -> bytes:
+        """Return the oldest state that is kept, and the stream since, for `load`."""
+        first = min(self._kept)
+        since = np.arange(first + 1, self.time + 1) % N_ROWS
+        arrays = {**_as_bytes(self._kept[first]), "stream": self._stream[since]}
+        times = {"start": self._start, "first": first, "time": self.time}
+        return dump_tensors(arrays, {**self._about(), **times}, "state", LARGEST_STATE)
+
+    def load(self, state: bytes) -> None:
+        """Go on where another one, made alike, was saved, with the same bits.
+
+        Raises:
+            ValueError: It is damaged, or of another road, estimator, setting or version. Nothing
+                has changed then.
+        """
+        require(isinstance(state, bytes), "state", "the bytes that save() returned", state)
+        card, arrays = parse_tensors(state, "state")
+        for name, value in self._about().items():
+            require(card.get(name) == value, f"state.{name}", repr(value), card.get(name))
+        start, first, now = (
+            integer(f"state.{name}", card.get(name), -LATEST, LATEST)
+            for name in ("start", "first", "time")
+        )
+        is_stream = start <= first <= now < first + N_ROWS
+        require(is_stream, "state.time", "one of a stream", now)
+        memory = self._copies()
+        shapes = {name: array.shape for name, array in _as_bytes(memory).items()}
+        stream = {"stream": (now - first, *self._stream.shape[1:])}
+        with within("state: "):
+            require_arrays({k: v for k, v in arrays.items() if k in shapes}, shapes, np.uint8)
+            require_arrays({k: v for k, v in arrays.items() if k not in shapes}, stream, float)
+        for i, array in enumerate(memory):
+            array[...] = arrays[f"memory_{i}"].view(array.dtype).reshape(array.shape)
+        self._start, self.time = start, first
+        self._kept = {first: memory}
+        self._stream[np.arange(first + 1, now + 1) % N_ROWS] = arrays["stream"]
+        self._restore(first)
+        self._estimates = {first: self._estimator.estimate()}
+        self._run(first, now)
+
+    def _about(self) -> dict[str, str]:
+        """Return what must be alike where a state is loaded."""
+        return {"format": FORMAT, "version": numbers_of(code_version()), **self._made_of}
+
+    def _entry(self, path: str, each: Any, now: int) -> Entry:
+        """Return what a source adds to the stream at second `now`, or refuse it."""
+        require(isinstance(each, Seen), path, "what station(), probes() or Seen() returns", each)
+        until, oldest = now if each.until is None else each.until, max(now - LONGEST, self._start)
+        allowed = f"in {oldest + 1}..{now}, which can still change"
+        require(oldest < until <= now, f"{path}.until", allowed, until)
+        pairs = ((each.density, each.density_std), (each.speed, each.speed_std))
+        weights = [0.0 if std is None else 1.0 / std**2 for _, std in pairs]
+        added = [(w, w * (value or 0.0)) for w, (value, _) in zip(weights, pairs, strict=True)]
+        before = max(until - each.seconds, oldest)
+        alike = min(each.seconds, ALIKE)
+        return Entry(before, until, self._segments(path, each), np.array(added) / alike)
+
+    def _segments(self, path: str, each: Seen) -> slice:
+        """Return the segments that a source says something of."""
+        faces = [face for face in self._borders if face is not None]
+        allowed = f"None or the face of a ramp, {faces}"
+        require(each.ramp in self._borders, f"{path}.ramp", allowed, each.ramp)
+        first, borders = self._borders[each.ramp]
+        for name in ("start", "end"):
+            place, allowed = getattr(each, name), f"in 0..{borders[-1]:g} km"
+            require(place <= borders[-1] + TOLERANCE, f"{path}.{name}", allowed, place)
+        n = len(borders) - 1
+        if each.start == each.end:
+            face = int(np.abs(borders - each.start).argmin())
+            if abs(borders[face] - each.start) > TOLERANCE:
+                text = f"{each.start:g} km lies within a segment, and counts at its border at"
+                warnings.warn(f"{text} {borders[face]:g} km", UserWarning, stacklevel=1)
+            low, high = max(face - 1, 0), min(face + 1, n)
+        else:
+            middles = 0.5 * (borders[:-1] + borders[1:])
+            low, high = np.searchsorted(middles, [each.start, each.end]).tolist()
+            if low == high:  # no middle is covered
+                middle = 0.5 * (each.start + each.end)
+                low = min(int(np.searchsorted(borders, middle, "right")) - 1, n - 1)
+                high = low + 1
+        return slice(first + low, first + high)
+
+    def _go_on(self, now: int, entries: Sequence[Entry]) -> None:
+        """Go on to second `now`, from before what has changed."""
+        self._stream[np.arange(self.time + 1, now + 1) % N_ROWS] = 0.0
+        changed = self.time
+        for before, until, segments, added in entries:
+            self._stream[np.arange(before + 1, until + 1) % N_ROWS, segments] += added
+            changed = min(changed, before)
+        back = max(second for second in self._kept if second <= changed)
+        if back < self.time:
+            self._restore(back)
+        self._run(back, now)
+
+    def _run(self, back: int, now: int) -> None:
+        """Go on from second `back`, whose state it is in, to second `now`."""
+        for second in range(back + 1, now + 1):
+            self._advance(second)
+            if now - second <= SPACING * (second & -second):
+                self._kept[second] = self._copies()
+        self.time = now
+        gone = [second for second in self._kept if second <= now - LONGEST]
+        first = max(gone, default=min(self._kept))
+        self._kept = {
+            second: state
+            for second, state in self._kept.items()
+            if second == first or (second > first and now - second <= SPACING * (second & -second))
+        }
+        self._estimates = {t: found for t, found in self._estimates.items() if t >= first}
+
+    def _advance(self, second: int) -> None:
+        """Go on by one second, by what was seen in it."""
+        weights, totals = np.moveaxis(self._stream[second % N_ROWS], -1, 0)
+        known = weights > 0.0
+        values = totals / np.where(known, weights, 1.0)
+        self._estimator.predict(_ONE, self._inputs(second, known, values))
+        if not known.all():
+            x = self._estimator.estimate()
+            values = np.where(known, values, np.stack([x.density[0], x.speed[0]], axis=-1))
+        sigma = np.where(known, weights, UNKNOWN**-2) ** -0.5
+        seen = known.any(axis=-1)
+        self._estimator.update(
+            _ONE, Measurement.of(self.model, seen[None], values[None], sigma[None])
+        )
+        self._estimates[second] = self._estimator.estimate()
+
+    def _inputs(self, second: int, known: BoolArray, values: FloatArray) -> FloatArray:
+        """Return the model's inputs (1, n_u) of a second."""
+        road, before, ends = self.corridor.road, self._estimates[second - 1], self._ends[0]
+        said = known[road.beside].all(axis=-1)
+        ends[said, :2], ends[said, 2] = values[road.beside[said]], second
+        fresh = second - ends[:, 2] <= LONGEST
+        density = np.where(fresh, ends[:, 0], before.density[:, road.beside])
+        speed = np.where(fresh, ends[:, 1], before.speed[:, road.beside])
+        inputs = self.model.boundary_inputs(density, speed)
+        elapsed = min(second - 1 - self._start, len(self._demand) - 1)
+        unseen = road.entry_inputs[~fresh[road.entry_cells - road.n_segments]]
+        for column in (unseen, unseen + 1):  # demand, and w
+            inputs[0, column] = self._demand[elapsed, column]
+        return inputs
+
+    def _copies(self) -> list[AnyArray]:
+        return [array.copy() for array in (*self._estimator.memory, self._ends)]
+
+    def _restore(self, second: int) -> None:
+        """Go back to the state of a second, and forget later ones."""
+        self._kept = {t: state for t, state in self._kept.items() if t <= second}
+        for array, kept in zip(
+            (*self._estimator.memory, self._ends), self._kept[second], strict=True
+        ):
+            array[...] = kept
+
+    def _distance(self, stations: Sequence[float]) -> float:
+        """Return the mean distance of stations [km], 0 where there are no two of them."""
+        places = convert(tuple[float, ...], stations, "stations")
+        length = self._borders[None][1][-1]
+        allowed = f"increasing places in 0..{length:g} km"
+        fits = list(places) == sorted(set(places)) and all(0.0 <= x <= length for x in places)
+        require(fits, "stations", allowed, places)
+        return (places[-1] - places[0]) / (len(places) - 1) if len(places) > 1 else 0.0
+
+
+def _borders(geometry: Geometry) -> Iterator[tuple[int | None, tuple[int, FloatArray]]]:
+    """Yield the mainline (None) and each ramp, by face: its first segment, its borders [km]."""
+    lengths = np.array(geometry.segment_lengths)
+    ramps = [(face, segments) for face, _, segments in geometry.ramps()]
+    for face, segments in [(None, tuple(range(geometry.n_mainline))), *ramps]:
+        ends = np.cumsum(lengths[list(segments)])
+        yield face, (segments[0], np.round(np.concatenate([[0.0], ends]), 9))
+
+
+def _as_bytes(arrays: Sequence[AnyArray]) -> dict[str, AnyArray]:
+    """Return arrays by name as bytes, so that NaN and flags can be stored, too."""
+    named = enumerate(arrays)
+    return {f"memory_{i}": np.frombuffer(each.tobytes(), np.uint8) for i, each in named}

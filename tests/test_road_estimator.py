@@ -1,0 +1,331 @@
+"""A door for a stream of one's own: readings in time or late, gaps, restarts and refusals."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from dptse_env import RoadEstimator, Seen, probes, station
+from dptse_env.estimators import ESTIMATORS
+from dptse_env.measurement.seen import LONGEST
+from dptse_env.road_estimator import N_ROWS
+from dptse_env.utils import files
+from tests.helpers import fast_and_slow
+
+ROAD = "short-highway"
+"""Six segments of .1 km, an on-ramp at face 2, an off-ramp at face 4."""
+BORDERS = (0.0, 0.3, 0.6)
+
+
+def make(estimator="random_walk", **keywords):
+    """A road's estimator."""
+    return RoadEstimator(ROAD, estimator, **keywords)
+
+
+def loops(seed, until=None, seconds=60, borders=BORDERS):
+    """Readings of loops at borders, drawn by a seed."""
+    rng = np.random.default_rng(seed)
+    return [
+        station(
+            km, count=int(rng.integers(5, 30)), speed=float(rng.uniform(20, 100)), seconds=seconds,
+            lanes=2, until=until,
+        )
+        for km in borders
+    ]  # fmt: skip
+
+
+def bits(road, delay=0):
+    """The estimates of a road, now or some seconds ago."""
+    return np.stack(road.estimate(delay))
+
+
+def played(road, until, every=60, late=0):
+    """Have readings come in at the end of every interval, or late; return the road."""
+    while road.time < until:
+        ended = road.time + 1 - late
+        comes = ended % every == 0 and ended > 0
+        road.step(loops(ended, until=ended, seconds=every) if comes else ())
+    return road
+
+
+def test_an_interval_counts_in_each_of_its_seconds_whenever_it_comes_in():
+    at_once, in_time, late = make(), make(), make()
+    at_once.step(loops(0), seconds=60)
+    for _ in range(59):
+        in_time.step()
+    in_time.step(loops(0))
+    late.step(seconds=200)
+    for road in (at_once, in_time):
+        road.step(seconds=140)
+    late.step(loops(0, until=60))
+    for road in (at_once, in_time):
+        road.step()
+    assert (bits(at_once) == bits(in_time)).all()
+    assert (bits(at_once) == bits(late)).all()
+    assert (bits(at_once) != bits(played(make(), 201))).any()
+
+
+def test_readings_may_come_in_any_order():
+    first, second = loops(1, until=100), loops(2, until=160)
+    ahead, back = make("asm"), make("asm")
+    for road, said in ((ahead, (first, second)), (back, (second, first))):
+        road.step(seconds=160)
+        for each in said:
+            road.step(each)
+    np.testing.assert_allclose(bits(ahead), bits(back), rtol=1e-9)
+
+
+def test_an_estimate_with_a_delay_is_that_of_then_with_what_came_in_since():
+    road = played(make("ekf"), 240)
+    then = played(make("ekf"), 180)
+    assert (bits(road, 60) == bits(then)).all()
+    assert (bits(road, 30) != bits(played(make("ekf"), 210))).any()  # 240 said something of 210
+    road.step(seconds=500)
+    assert bits(road, LONGEST).shape == (4, 8)
+
+
+def test_sources_of_a_second_are_put_together_by_their_variances():
+    several, one = make(), make()
+    several.step(
+        [Seen(0.1, 0.2, 40.0, 80.0, 3.0, 5.0), Seen(0.1, 0.2, 70.0, None, 6.0, None)]
+    )  # weights 4 : 1
+    one.step([Seen(0.1, 0.2, 46.0, 80.0, np.sqrt(7.2), 5.0)])
+    np.testing.assert_allclose(bits(several), bits(one), rtol=1e-12)
+
+
+@pytest.mark.parametrize("estimator", ["random_walk", "ekf", "recurrent"])
+def test_what_nobody_saw_is_as_predicted(estimator):
+    blind, seeing = make(estimator), make(estimator)
+    blind.step()
+    seeing.step([probes(0.2, 0.3, 30.0, vehicles=9, seconds=1)])
+    (density, speed, *_), seen = bits(blind), bits(seeing)
+    assert speed[2] - seen[1][2] > 1.0
+    if estimator == "random_walk":  # the others know of speeds what it means for densities
+        np.testing.assert_array_equal(density, seen[0])
+
+
+@pytest.mark.parametrize(
+    ("place", "segments"),
+    [
+        ((0.0, 0.0, None), [0]),
+        ((0.2, 0.2, None), [1, 2]),
+        ((0.6, 0.6, None), [5]),
+        ((0.16, 0.16, None), [1, 2]),
+        ((0.1, 0.3, None), [1, 2]),
+        ((0.04, 0.16, None), [0, 1]),
+        ((0.12, 0.14, None), [1]),
+        ((0.0, 0.6, None), [0, 1, 2, 3, 4, 5]),
+        ((0.0, 0.0, 2), [6]),
+        ((0.1, 0.1, 4), [7]),
+        ((0.02, 0.07, 4), [7]),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*lies within a segment")
+def test_a_source_says_something_of_the_segments_at_its_place(place, segments):
+    *ends, ramp = place
+    road, blind = make(), make()
+    road.step([Seen(*ends, speed=20.0, speed_std=1.0, ramp=ramp)])
+    blind.step()
+    changed = np.flatnonzero(bits(road)[1] < bits(blind)[1])
+    assert changed.tolist() == segments
+
+
+def test_a_point_within_a_segment_is_said_to_count_at_its_border():
+    with pytest.warns(UserWarning, match=r"^0\.16 km lies .* counts at its border at 0\.2 km$"):
+        make().step(loops(0, borders=[0.16]), seconds=60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make().step(loops(0, borders=[0.2004]), seconds=60)
+
+
+def test_what_is_said_at_an_end_enters_there_until_it_is_ten_minutes_old():
+    said, none = make("open_loop"), make("open_loop")
+    for road, seen in ((said, loops(3, borders=[0.0])), (none, [])):
+        road.step(seen, seconds=60)
+        road.step(seconds=LONGEST)
+    assert abs(bits(said)[0, 0] - bits(none)[0, 0]) > 1.0
+    for road in (said, none):
+        road.step(seconds=LONGEST)
+    np.testing.assert_allclose(bits(said)[0], bits(none)[0], atol=0.1)
+
+
+def test_nobody_says_anything_for_two_hours():
+    road = make(start=-100)
+    road.step(seconds=7200)
+    assert np.isfinite(bits(road)).all()
+    assert road.time == 7100
+
+
+def test_late_data_go_back_only_as_far_as_needed():
+    road, steps = played(make(), 900), []
+    predict = road._estimator.predict
+    road._estimator.predict = lambda *args: steps.append(1) or predict(*args)
+    for age in (0, 7, 100, 540):
+        steps.clear()
+        road.step(loops(age, until=road.time + 1 - age))
+        assert 60 + age <= len(steps) <= 1.15 * (60 + age) + 8
+
+
+def test_memory_is_bounded():
+    road = played(make(), 1400)
+    kept, size = len(road._kept), len(road.save())
+    played(road, 2100)
+    assert len(road._kept) <= kept + 10 <= 60
+    assert len(road._estimates) <= N_ROWS
+    assert len(road.save()) <= 1.25 * size
+
+
+# Restarts
+
+
+@pytest.mark.parametrize("estimator", fast_and_slow(ESTIMATORS, ["enkf", "mhe", "recurrent"]))
+def test_a_restart_gives_the_same_bits(estimator):
+    road = played(make(estimator, start=1_700_000_003), 1_700_000_700)
+    state = road.save()
+    again = make(estimator)
+    again.load(state)
+    assert again.save() == state
+    for each in (road, again):
+        each.step(loops(5, until=1_700_000_400, seconds=120))
+        played(each, 1_700_000_800)
+    assert (bits(road) == bits(again)).all()
+    assert (bits(road, LONGEST) == bits(again, LONGEST)).all()
+
+
+def test_a_state_is_saved_ahead_of_the_first_step():
+    road, again = make(), make(start=7)
+    again.load(road.save())
+    assert again.time == 0
+    assert (bits(road) == bits(again)).all()
+
+
+def flipped(state):
+    """A state with a bit that fell over."""
+    return state[:-5] + bytes([state[-5] ^ 1]) + state[-4:]
+
+
+@pytest.mark.parametrize(
+    ("other", "damage", "message"),
+    [
+        (lambda: RoadEstimator("paper-highway", "asm"), bytes, r"^state\.road must be '\w+', got"),
+        (lambda: make("ekf"), bytes, r"^state\.estimator must be .*AdaptiveSmoothing', got .*EKF'"),
+        (lambda: make("asm", stations=(0.0, 0.6)), bytes, r"^state\.settings must be '\w+', got"),
+        (lambda: make("asm", parameters="published"), bytes, r"^state\.settings must be"),
+        (lambda: make("asm"), flipped, "^state is damaged, .*digest"),
+        (lambda: make("asm"), lambda state: state[:1000], "^state is damaged"),
+        (lambda: make("asm"), lambda _: b"", "^state is damaged"),
+        (lambda: make("asm"), lambda _: "text", "^state must be the bytes that save"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused_and_nothing_is_lost(other, damage, message):
+    state = played(other(), 70).save()
+    road = played(make("asm"), 130)
+    before = road.save()
+    with pytest.raises(ValueError, match=message) as problem:
+        road.load(damage(state))
+    assert "\n" not in str(problem.value)
+    assert road.save() == before
+    assert (bits(played(road, 200)) == bits(played(make("asm"), 200))).all()
+
+
+def test_a_state_of_another_version_is_refused(monkeypatch):
+    state = make().save()
+    monkeypatch.setattr("dptse_env.road_estimator.code_version", lambda: "0.0.1+abc")
+    with pytest.raises(ValueError, match=r"^state\.version must be 'abc', got"):
+        make().load(state)
+
+
+@pytest.mark.parametrize("name", ["memory_0", "stream"])
+def test_a_state_with_other_arrays_is_refused(name):
+    road = played(make(), 70)
+    card, arrays = files.parse_tensors(road.save(), "state")
+    del card["sha256"]
+    for wrong in (
+        {name: arrays[name][:-1]},
+        {name: arrays[name].astype(np.int32)},
+        {"x": arrays[name]},
+    ):
+        state = files.dump_tensors({**arrays, **wrong}, card, "state", 2**30)
+        with pytest.raises(ValueError, match=r"^state: (\w+ must be|it has)"):
+            road.load(state)
+
+
+# Bad input
+
+
+OUTSIDE = [
+    (
+        [Seen(0.7, 0.7, speed=90, speed_std=9)],
+        r"seen\[0\]\.start must be in 0\.\.0\.6 km, got 0\.7",
+    ),
+    ([Seen(0.1, 0.9, speed=90, speed_std=9)], r"seen\[0\]\.end must be in 0\.\.0\.6 km, got 0\.9"),
+    (
+        [Seen(0.1, 0.1, speed=90, speed_std=9, ramp=3)],
+        r"seen\[0\]\.ramp must be None or the face of a ramp, \[2, 4\], got 3",
+    ),
+    (loops(0, until=131), r"seen\[0\]\.until must be in 1\.\.130, .*, got 131"),
+    (loops(0, until=0), r"seen\[0\]\.until must be in 1\.\.130, .*, got 0"),
+    ([*loops(0), (0.1, 0.2)], r"seen\[3\] must be what station\(\), .*, got \(0\.1, 0\.2\)"),
+    (Seen(0.1, 0.1, speed=90, speed_std=9), "seen must be a sequence"),
+    ("abc", "seen must be a sequence"),
+    (None, "seen must be a sequence"),
+]
+
+
+@pytest.mark.parametrize(("seen", "message"), OUTSIDE)
+def test_a_step_that_is_refused_changes_nothing(seen, message):
+    road = played(make(), 129)
+    before = road.save()
+    with pytest.raises(ValueError, match=f"^{message}") as problem:
+        road.step(seen)
+    assert "\n" not in str(problem.value)
+    assert road.save() == before
+
+
+def test_what_is_too_old_to_count_is_refused():
+    road = played(make(), 900)
+    before = road.save()
+    with pytest.raises(ValueError, match=r"^seen\[0\]\.until must be in 302\.\.901, .*, got 301"):
+        road.step(loops(0, until=301))
+    with pytest.raises(ValueError, match=r"^seen\[0\]\.until must be in 8501\.\.9100, .* got 900"):
+        road.step(loops(0, until=900), seconds=8200)
+    assert road.save() == before
+    road.step(loops(0, until=302, seconds=600))
+
+
+@pytest.mark.parametrize("seconds", [0, -1, 1.5, "1", None, float("nan"), 10**9])
+def test_a_step_of_no_seconds_is_refused(seconds):
+    with pytest.raises(ValueError, match=r"^seconds must be an integer"):
+        make().step(seconds=seconds)
+
+
+@pytest.mark.parametrize("delay", [-1, 11, 1.5, None])
+def test_a_delay_beyond_the_stream_is_refused(delay):
+    road = make()
+    road.step(seconds=10)
+    with pytest.raises(ValueError, match=r"^delay must be an integer in 0\.\.10, got"):
+        road.estimate(delay)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"start": 1.5}, "start must be an integer"),
+        ({"stations": 5}, "stations must be a sequence"),
+        ({"stations": (0.5, 0.2)}, r"stations must be increasing places in 0\.\.0\.6 km, got"),
+        ({"stations": (0.5, 0.7)}, r"stations must be increasing places in 0\.\.0\.6 km, got"),
+        ({"stations": (0.5, float("nan"))}, r"stations\[1\] must be a finite number, got nan"),
+        ({"estimator": "no"}, "estimator must be one of"),
+        ({"parameters": "no"}, "parameters must be one of"),
+        ({"estimator_settings": {"no": 1}}, r"estimator_settings\.no is unknown"),
+    ],
+)
+def test_keywords_are_refused_by_name(keywords, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        make(**keywords)
+
+
+@pytest.mark.parametrize("name", ["bandwidth", "privacy", "penetration", "seed"])
+def test_keywords_of_queries_are_none_of_a_stream(name):
+    with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'"):
+        make(**{name: 1})
