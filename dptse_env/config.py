@@ -329,9 +329,19 @@ def _detectors(
     return found
 
 
-def _backend(path: str, value: Any, base: Any, estimator: Any) -> str:
-    """Return the backend, which the estimator must have."""
+def _estimator(path: str, value: Any, base: Any, corridor: Corridor) -> Any:
+    """Return the estimator, which readings of loops take back in time."""
+    part = _part(ESTIMATORS, path, value, base)
+    goes_back = "one that has _memory, to go back in time on a road with loops"
+    require(corridor.loops is None or ESTIMATORS.find(part).goes_back(), path, goes_back, part)
+    return part
+
+
+def _backend(path: str, value: Any, base: Any, estimator: Any, corridor: Corridor) -> str:
+    """Return the backend, which the estimator must have, and which loops must leave."""
     check_estimator(estimator, value)
+    goes_back = "'compiled' on a road with loops, since no reference goes back in time"
+    require(corridor.loops is None or value == "compiled", path, goes_back, value)
     return str(_typed(path, value, base))
 
 
@@ -501,8 +511,8 @@ KEYWORDS = {
     "penetration": Keyword(_penetration, ("corridor", "privacy")),
     "detectors": Keyword(_detectors, ("corridor", "privacy")),
     "fusion": Keyword(),
-    "estimator": Keyword(partial(_part, ESTIMATORS)),
-    "backend": Keyword(_backend, ("estimator",)),
+    "estimator": Keyword(_estimator, ("corridor",)),
+    "backend": Keyword(_backend, ("estimator", "corridor")),
     "parameters": Keyword(_parameters),
     "estimator_settings": Keyword(_settings, ("estimator", "parameters", "privacy", "corridor")),
     "query_spans": Keyword(_spans, ("corridor", "privacy")),

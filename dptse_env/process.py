@@ -78,6 +78,8 @@ class QueryProcess:
         detectors: Errors of the fixed sensors; None where they have none.
         fusion: Turns releases into measurements of all vehicles; None where they are these.
         loops: Readings of loop detectors; None where there are none.
+        replay: Takes the estimator back to where an interval began, with its readings; None where
+            there are no loops.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
         start: Second that it began at, below 0 before its first reset, shape (n,).
@@ -135,10 +137,10 @@ class QueryProcess:
         is_fused = config.has_separate_sensors
         self.fusion = Fusion(task, config.fusion, share) if is_fused else None
         self._threads = EpisodeThreads(threads if self.estimator.is_compiled else 1)
-        self.loops, self._replay = None, None
+        self.loops, self.replay = None, None
         if config.corridor.loops is not None:
             self.loops = LoopReadings(task, self.traffic)
-            self._replay = Replay(self.loops, self.estimator, task, self._threads)
+            self.replay = Replay(self.loops, self.estimator, task, self._threads)
         self._checks_estimates = is_foreign(self.estimator)
         self._checks_releases = is_foreign(self.release)
         self._checks_decisions = is_foreign(self.interface.actions)
@@ -214,8 +216,8 @@ class QueryProcess:
         self.boundary.reset(episodes)
         prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
         self.estimator.reset(episodes, prior, for_estimator)
-        if self._replay is not None:
-            self._replay.begin(episodes)
+        if self.replay is not None:
+            self.replay.begin(episodes, starts)
         self.queried[episodes] = False
         self.n_dropped[episodes] = 0
         self.age[episodes] = AGE_CAP
@@ -283,8 +285,8 @@ class QueryProcess:
         measured = self.measure(request)
         self.boundary.update(episodes, measured)
         self._threads.run(self.estimator.update, episodes, measured, Measurement.at)
-        if self._replay is not None:
-            self._replay.follow(episodes, traffic, self.time[episodes], inputs, measured)
+        if self.replay is not None:
+            self.replay.follow(episodes, traffic, self.time[episodes], inputs, measured)
         self.queried[own] = queried
         rows = slice(self.released.shape[1])
         answered = measured.observed[:, rows, None]

@@ -250,6 +250,11 @@ class Estimator(ABC):
             np.minimum(estimate.speed, self._largest_speed, out=estimate.speed)
         return estimate
 
+    @classmethod
+    def goes_back(cls) -> bool:
+        """Return whether its episodes can go back in time: it says what it remembers."""
+        return cls._memory is not Estimator._memory
+
     @property
     def memory(self) -> tuple[AnyArray, ...]:
         """All that an episode's past has left, arrays with an axis over the n episodes in front.

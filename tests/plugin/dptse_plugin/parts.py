@@ -38,6 +38,10 @@ class Smoothed(Estimator):
         super().__init__(model, n_episodes, settings)
         self.traffic = np.zeros((n_episodes, model.n_segments, 2))
 
+    @property
+    def _memory(self) -> Any:
+        return (self.traffic,)
+
     def _reset(self, episodes: Any, states: Any, generators: Any) -> None:
         traffic = [self.model.density(states), self.model.speed(states)]
         self.traffic[episodes] = np.stack(traffic, axis=-1)

@@ -1,0 +1,330 @@
+"""Replay: an estimator that lives through intervals again, in every use of the process."""
+
+import copy
+import pickle
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from dptse_env.config import resolve
+from dptse_env.estimators import ESTIMATORS, REFERENCES, Estimate, Estimator
+from dptse_env.process import QueryProcess
+from dptse_env.utils.threads import SMALLEST_BLOCK
+from tests.helpers import COUNTED, PAID, SHORT, assert_same, fast_and_slow, lock_step, make_batch
+
+T = 7
+LOOPS = {"positions": [0.0, 0.2, 0.6], "ramps": [2], "interval": T, "least_count": 1}
+SEEDS = (11, 12, 13, 14)
+ALL = np.arange(4)
+STARTS = {"traffic_seed": [0, 1, 2, 1], "start": [0, 10, 39, 41]}
+"""Episodes that begin at an interval's beginning and within one, and in its last second."""
+
+
+def begun(**keywords):
+    given = {"traffic_seeds": "0:3", "horizon": 60, "random_start": True, "loops": LOOPS}
+    process = QueryProcess(resolve("short-highway", {**given, **keywords}), 4)
+    process.reset(ALL, [np.random.default_rng(seed) for seed in SEEDS], STARTS)
+    return process
+
+
+def sampled(process, n_steps):
+    space = process.interface.actions.space
+    space.seed(5)
+    return [np.array([space.sample() for _ in ALL]) for _ in range(n_steps)]
+
+
+def assert_alike(one, two, episodes=ALL):
+    for mine, other in zip(one.memory, two.memory, strict=True):
+        np.testing.assert_array_equal(mine[episodes], other[episodes])
+
+
+# --- the truth of it ------------------------------------------------------------------------------
+
+WAYS = [("ekf", PAID), ("recurrent", COUNTED), ("enkf", "printed"), ("mhe", PAID)]
+
+
+@pytest.mark.parametrize(
+    ("estimator", "privacy"),
+    fast_and_slow([(e, p) for e in ESTIMATORS for p in ("printed", COUNTED, PAID)], WAYS),
+)
+def test_the_estimator_is_as_if_it_had_had_the_readings_in_every_second(estimator, privacy):
+    """At each interval's end, bit for bit, but for what it says of the releases of this second."""
+    process = begun(estimator=estimator, privacy=privacy)
+    by_hand, given = copy.deepcopy(process.estimator), {e: [] for e in ALL.tolist()}
+    kept = process.replay.follow
+
+    def spy(episodes, traffic, times, inputs, measured):
+        for k, episode in enumerate(episodes.tolist()):
+            own = measured.at(slice(k, k + 1))
+            seen = own.observed[..., None]  # the rest may be anything, and is not kept
+            own = own._replace(values=own.values * seen, sigma=own.sigma * seen)
+            given[episode].append((inputs[k : k + 1].copy(), own))
+        kept(episodes, traffic, times, inputs, measured)
+
+    process.replay.follow = spy
+    n_ends = 0
+    for action in sampled(process, 30):
+        process.step(ALL, action)
+        for episode in ALL[process.time % T == 0]:
+            own = np.array([episode])
+            interval = process.time[own] // T - 1
+            loops = process.loops
+            said = loops.said(loops.read(process.traffic_index[own], interval))
+            for inputs, measured in given[episode]:
+                by_hand.predict(own, inputs)
+                by_hand.update(own, loops.added(measured, said))
+            given[episode].clear()
+            for name in ("innovations", "diverged", "fallback"):
+                getattr(by_hand, name)[own] = getattr(process.estimator, name)[own]
+            assert_alike(by_hand, process.estimator, own)
+            for mine, other in zip(by_hand.estimate(), process.estimate, strict=True):
+                np.testing.assert_array_equal(mine[own], other[own])
+            n_ends += 1
+    assert n_ends == 4 + 4 + 4 + 5
+
+
+def test_readings_come_at_the_ends_of_intervals_alone():
+    """In between, an estimate depends on nothing that an interval will report."""
+    with_loops, without = begun(privacy="printed"), begun(privacy="printed", loops=None)
+    differs = []
+    for action in sampled(with_loops, 15):
+        for process in (with_loops, without):
+            process.step(ALL, action)
+        same = with_loops.estimate.density == without.estimate.density
+        differs.append(~same.all(axis=1))
+    first = np.argmax(differs, axis=0)
+    np.testing.assert_array_equal(first, T - 1 - np.array(STARTS["start"]) % T)
+
+
+# --- what rules and reports see -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "mixture"])
+def test_a_reading_is_no_query(estimator):
+    """Ages, queries and releases are those without loops; innovations those of releases alone."""
+    given = {"estimator": estimator, "privacy": COUNTED}
+    with_loops, without = begun(**given), begun(**given, loops=None)
+    for second, action in enumerate(sampled(with_loops, 20)):
+        for process in (with_loops, without):
+            process.step(ALL, action)
+        for name in ("age", "queried", "released"):
+            np.testing.assert_array_equal(getattr(with_loops, name), getattr(without, name))
+        innovations = with_loops.estimator.innovations
+        observed = with_loops.release.task.observed(with_loops.queried)[:, : innovations.shape[1]]
+        assert (innovations[~observed] == 0.0).all()
+        assert (innovations[observed] != 0.0).all()
+        early = second < T - 1 - np.array(STARTS["start"]) % T
+        np.testing.assert_array_equal(innovations[early], without.estimator.innovations[early])
+
+
+def test_a_filter_that_starts_over_in_a_replay_says_so():
+    process = begun(privacy="printed")
+    actions, added = sampled(process, T), process.loops.added
+
+    def spoilt(measured, said):
+        values = added(measured, said).values.copy()
+        values[0] = np.nan  # in the first second that is lived through again
+        return added(measured, said)._replace(values=values)
+
+    process.loops.added = spoilt
+    for action in actions[:-1]:
+        process.step(ALL[:1], action[:1])
+        assert process.info(0)["diverged"] == 0.0
+    process.step(ALL[:1], actions[-1][:1])
+    assert process.info(0)["diverged"] == 1.0
+    assert np.isfinite(process.estimate.density).all()
+
+
+# --- batches --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("estimator", "action", "privacy"),
+    [("ekf", "sequential", PAID), ("enkf", "mask", COUNTED), ("recurrent", "slots", "printed")],
+)
+def test_a_batch_is_so_many_single_episodes_bit_for_bit(estimator, action, privacy):
+    given = {"estimator": estimator, "action": action, "privacy": privacy}
+    batch = begun(**given)
+    actions = sampled(batch, 45)
+    together = [batch.step(ALL, each) for each in actions]
+    for e in ALL.tolist():
+        alone = QueryProcess(batch.config)
+        options = {key: values[e] for key, values in STARTS.items()}
+        alone.reset(ALL[:1], [np.random.default_rng(SEEDS[e])], options)
+        for each, outcome in zip(actions, together, strict=True):
+            own = alone.step(ALL[:1], each[e : e + 1])
+            for name in ("observation", "reward", "truncated"):
+                mine, other = getattr(own, name)[0], getattr(outcome, name)[e]
+                np.testing.assert_array_equal(mine, other)
+        assert_same(alone.info(0), batch.info(e))
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_episodes_begin_again_within_intervals(mode):
+    """Of six seconds, where an interval has four, and with resets of some in between."""
+    loops = {**LOOPS, "interval": 4}
+    lock_step({"loops": loops, "truth_in_info": True}, 20, autoreset_mode=mode)
+
+
+def test_nothing_is_left_of_an_episode_that_began_anew():
+    """Of the interval that a reset ends, and of the one that it begins in."""
+    used, fresh = begun(privacy=PAID), begun(privacy=PAID)
+    actions = sampled(used, 40)
+    for action in actions[:17]:
+        used.step(ALL, action)
+    generators = [np.random.default_rng(seed) for seed in SEEDS]
+    used.reset(ALL, generators, STARTS)
+    for action in actions[17:]:
+        here, there = used.step(ALL, action), fresh.step(ALL, action)
+        np.testing.assert_array_equal(here.observation, there.observation)
+
+
+def test_an_episode_may_pause_while_others_go_on():
+    mixed, whole = begun(), begun()
+    actions = sampled(whole, 30)
+    for each in actions:
+        whole.step(ALL, each)
+    for each in actions[:10]:
+        mixed.step(ALL[[3, 0]], each[[3, 0]])
+    for each in actions[:10]:
+        mixed.step(ALL[1:3], each[1:3])
+    for each in actions[10:]:
+        mixed.step(ALL, each)
+    assert_alike(mixed.estimator, whole.estimator)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "recurrent"])
+def test_threads_change_nothing(estimator):
+    n = 3 * SMALLEST_BLOCK
+    given = {"estimator": estimator, "loops": {**LOOPS, "interval": 4}}
+    one, two = (make_batch(n, threads=threads, **given) for threads in (1, 2))
+    assert_same(one.reset(seed=5), two.reset(seed=5))
+    one.action_space.seed(1)
+    for _ in range(10):
+        actions = one.action_space.sample()
+        assert_same(one.step(actions), two.step(actions))
+
+
+# --- copies ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [QueryProcess.fork, copy.deepcopy, lambda process: pickle.loads(pickle.dumps(process))],
+    ids=["fork", "deepcopy", "pickle"],
+)
+@pytest.mark.parametrize("estimator", ["ekf", "enkf"])
+def test_a_copy_that_is_stepped_like_its_origin_gives_the_same_bits(copied, estimator):
+    """From within an interval past the ends of two, and its origin is left alone."""
+    origin = begun(estimator=estimator)
+    expected = begun(estimator=estimator)
+    actions = sampled(origin, 25)
+    for action in actions[:5]:
+        origin.step(ALL, action)
+        expected.step(ALL, action)
+    ahead, other = copied(origin), copied(origin)
+    for action in actions[5:]:
+        other.step(ALL, action[::-1])
+    for action in actions[5:]:
+        there = ahead.step(ALL, action)
+        here, undisturbed = origin.step(ALL, action), expected.step(ALL, action)
+        for name in ("observation", "reward", "truncated"):
+            np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
+            np.testing.assert_array_equal(getattr(here, name), getattr(undisturbed, name))
+    assert_alike(origin.estimator, ahead.estimator)
+    assert not np.array_equal(other.estimate.density, origin.estimate.density)
+
+
+# --- what is kept ---------------------------------------------------------------------------------
+
+
+def bytes_of(part):
+    found = [part] if isinstance(part, np.ndarray) else part
+    return sum(array.nbytes for array in found)
+
+
+@pytest.mark.parametrize("preset", ["paper-highway", "private-highway", "long-highway"])
+def test_one_state_is_kept_for_an_interval_and_little_more(preset):
+    """At an interval of 20 s less than the estimator's state twice."""
+    loops = {"positions": [0.0, 0.5, 1.0], "interval": 20}
+    config = resolve(preset, {"traffic_seeds": [0], "loops": loops, "estimator": "ekf"})
+    process = QueryProcess(config, 4)
+    own = [part for part in vars(process.replay).values() if isinstance(part, np.ndarray | list)]
+    assert sum(map(bytes_of, own)) < 2 * bytes_of(process.estimator.memory)
+
+
+# --- estimators of other packages, and those that cannot go back ----------------------------------
+
+
+class Held(Estimator):
+    """The last release of each segment by itself, held until the next one."""
+
+    def __init__(self, model, n_episodes, settings):
+        super().__init__(model, n_episodes, settings)
+        self.held = np.full((n_episodes, model.n_segments, 2), 50.0)
+
+    def _reset(self, episodes, states, generators):
+        self.held[episodes] = 50.0
+
+    def _predict(self, episodes, inputs):
+        self.held[episodes, :, 0] += 0.1
+
+    def _update(self, episodes, measured):
+        observed, values = measured.observed[:, : self.held.shape[1]], measured.values
+        read = np.where(observed[..., None], values[:, : self.held.shape[1]], self.held[episodes])
+        self.held[episodes] = read
+
+    def _estimate(self):
+        density, speed = self.held[..., 0].copy(), self.held[..., 1].copy()
+        return Estimate(density, speed, np.full_like(density, 20.0), np.full_like(speed, 10.0))
+
+
+class Remembering(Held):
+    """One whose episodes can go back."""
+
+    @property
+    def _memory(self):
+        return (self.held,)
+
+
+class Copying(Held):
+    """One that hands out what nothing can be written back to."""
+
+    @property
+    def _memory(self):
+        return (self.held.copy(),)
+
+
+def test_an_estimator_of_another_package_goes_back_by_what_it_remembers():
+    process = begun(estimator=Remembering, privacy="printed")
+    nothing, before = np.zeros((4, 6), dtype=np.int8), []
+    for _ in range(T - 1):
+        process.step(ALL, nothing)
+        before.append(process.estimate.density[0].copy())
+    process.step(ALL, nothing)
+    fixed = list(process.config.corridor.fixed_sensors)
+    beside = np.unique(process.loops.stations.beside)
+    said = process.loops.said(process.loops.read(process.traffic_index[:1], np.array([0])))
+    unseen = np.setdiff1d(np.arange(8), [*beside, *fixed])
+    np.testing.assert_allclose(process.estimate.density[0, unseen], before[-1][unseen] + 0.1)
+    known = np.isfinite(said.density[0]) & ~np.isin(beside, fixed)
+    assert known.any()
+    read = process.estimate.density[0, beside[known]]
+    np.testing.assert_array_equal(read, said.density[0, known])
+
+
+@pytest.mark.parametrize("make", [partial(gym.make, SHORT), make_batch])
+def test_an_estimator_that_cannot_go_back_is_refused_before_anything_is_recorded(make):
+    message = "^estimator must be one that has _memory, .* on a road with loops, got .*Held"
+    with pytest.raises(ValueError, match=message):
+        make(estimator=Held, loops=LOOPS)
+    make(estimator=Held)
+    message = "^estimator must return its own arrays as _memory, got .*Copying"
+    with pytest.raises(ValueError, match=message):
+        make(estimator=Copying, loops=LOOPS).reset(seed=0)
+    for name in REFERENCES:
+        message = "backend must be 'compiled' on a road with loops, .*, got 'reference'"
+        with pytest.raises(ValueError, match=message):
+            make(estimator=name, backend="reference", loops=LOOPS)
