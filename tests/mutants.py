@@ -724,6 +724,89 @@ MUTANTS = (
         "level = np.ceil(", "level = np.floor(",
         "privacy/test_gaussian.py",
     ),
+    # --- loops ----------------------------------------------------------------------------------
+    Mutant(
+        "loops leave out a vehicle that is not connected", 25, "release/vehicles.py",
+        "readings(record, self._stations",
+        "readings(record.without(int(np.argmin(self.populations[0].connected(self.seeds[index], "
+        "record)))) if self.populations and self.populations[0] else record, self._stations",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "a reading counts a part of its interval", 25, "traffic/readings.py",
+        "whole = interval < K", "whole = (interval < K) & (second % loops.interval > 2)",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "who passes in the last second counts in the next interval", 25, "traffic/readings.py",
+        "interval = (second - 1) // loops.interval", "interval = second // loops.interval",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "a reading comes before its interval", 25, "measurement/replay.py",
+        "times[ends] // self._loops.interval - 1)",
+        "np.minimum(times[ends] // self._loops.interval, 4))",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "a reading holds true densities", 25, "measurement/loops.py",
+        "self._traffic.readings[traffic, interval]",
+        "self._traffic.readings[traffic, interval] "
+        "+ self._traffic.aggregates(traffic, interval)[:, :1]",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "the least count is ignored", 25, "traffic/readings.py",
+        "table[table[..., 0] < loops.least_count] = np.nan", "table[table[..., 0] < 0] = np.nan",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "an interval without a vehicle is reported below the least count", 25,
+        "traffic/readings.py",
+        "table[table[..., 0] < loops.least_count] = np.nan",
+        "table[(table[..., 0] < loops.least_count) & (table[..., 0] > 0)] = np.nan",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "the least count hides speeds alone", 25, "traffic/readings.py",
+        "table[table[..., 0] < loops.least_count] = np.nan",
+        "table[table[..., 0] < loops.least_count, 1] = np.nan",
+        "test_non_interference.py",
+    ),
+    Mutant(
+        "a loop is a channel of the release", 25, "release/task.py",
+        "np.concatenate([self.sensors, np.arange(self.n_on_road, self.n_channels)])",
+        "np.concatenate([self.sensors, np.arange(self.corridor.loops is not None), "
+        "np.arange(self.n_on_road, self.n_channels)])",
+        "test_guarantee.py",
+    ),
+    Mutant(
+        "vehicles pay for loops", 25, "process.py",
+        "if self.replay is not None:\n            self.replay.follow(",
+        "if self.replay is not None:\n            self.release.ledgers.paid[episodes] += 1.0; "
+        "self.replay.follow(",
+        "test_guarantee.py",
+    ),
+    Mutant(
+        "a report does not say that it is conditional on loops", 25, "parts.py",
+        "report = report.beside(loops)", "pass",
+        "release/test_report.py",
+    ),
+    Mutant(
+        "a guarantee is stated without its condition", 25, "release/report.py",
+        'f"{self.guarantee}, {GIVEN_LOOPS}"', "self.guarantee",
+        "release/test_report.py",
+    ),
+    Mutant(
+        "beside loops a report protects presence", 25, "release/task.py",
+        "change.reports if has_loops else change.rows", "change.rows",
+        "release/test_report.py",
+    ),
+    Mutant(
+        "a report does not warn that a vehicle alone shows its speed", 25, "release/report.py",
+        'if loops.least_count < 2 else ""', 'if loops.least_count < 0 else ""',
+        "release/test_report.py",
+    ),
 )  # fmt: skip
 
 

@@ -17,9 +17,16 @@ from dptse_env.parts import make_release
 from dptse_env.privacy import ROUNDING, mu_of
 from dptse_env.process import QueryProcess
 from dptse_env.release import CappedSettings, Paced, PacedSettings, Pacing, Request
-from dptse_env.traffic import SHORT_HIGHWAY, Penetration, RecordLibrary
-from tests.helpers import AWAY, fast_and_slow, make_env, play, record
-from tests.release.worlds import ONE, Worlds
+from dptse_env.traffic import (
+    SHORT_HIGHWAY,
+    Loops,
+    Penetration,
+    RecordLibrary,
+    Stations,
+    readings,
+)
+from tests.helpers import AWAY, assert_same, fast_and_slow, make_env, play, record
+from tests.release.worlds import ONE, Worlds, alike_to_loops
 
 CAPPED, PACED = {"preset": "capped", "cap": 5}, {"preset": "paced", "epsilon": 0.5}
 
@@ -376,6 +383,75 @@ def test_no_two_worlds_are_further_apart_than_what_is_spent(number):
         trips = adjacent_trips(config, kinds, generator)
         records = records_of(trips, one_of(*OTHERS)(generator, 30), generator)
         distances(config, records, plan(config, trips, likely, generator), number)
+
+
+def alike_trips(config, generator):
+    """The trip of a vehicle in either world, as in `adjacent_trips`, with the same readings."""
+    zero, one = alike_to_loops(config.corridor, 1, generator)
+    face, upstream_end = config.corridor.loops.faces(ROAD.geometry)[0], ROAD.geometry.n_segments
+    is_before = [(trip[0] < face) | (trip[0] == upstream_end) for trip in (zero, one)]
+    if config.privacy.adjacency == "add_remove":
+        is_shown = getattr(config.penetration, "worlds", (True, True))
+        if is_shown[0] != is_shown[1]:
+            one = zero  # it leaves its reports out
+        else:
+            zero, one = (np.where(is_before[0], zero[0], AWAY), zero[1]), nobody(generator)
+    if config.privacy.unit == "event":
+        sides = np.concatenate(is_before)
+        calm = [t for t in range(1, HORIZON) if np.unique(sides[:, t - 1 : t + 2]).size == 1]
+        own = np.arange(DURATION + 1) != generator.choice(calm)
+        one = tuple(np.where(own, *each) for each in zip(zero, one, strict=True))
+    return zero, one
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("number", fast_and_slow(range(40), range(2)))
+def test_beside_loops_no_two_worlds_of_equal_readings_are_further_apart(number):
+    """Centres, prices and the estimator read loops, and loops cost nothing."""
+    found = []
+    for each in range(6):
+        generator = np.random.default_rng((number, each, 1))
+
+        def one_of(*values, draw=generator.integers):
+            return values[draw(len(values))]
+
+        config = configuration(one_of)
+        loops = Loops((one_of(0.1, 0.3, 0.5),), interval=one_of(4, 7, 10), least_count=one_of(0, 3))
+        road, spans = config.corridor.replaced(loops=loops), {1, *config.query_spans}
+        config = dataclasses.replace(config, corridor=road, query_spans=tuple(sorted(spans)))
+        trips = alike_trips(config, generator)
+        records = records_of(trips, one_of(*OTHERS)(generator, 30), generator)
+        stations = Stations.of(loops, ROAD.geometry)
+        np.testing.assert_array_equal(*(readings(each, stations, loops) for each in records[:2]))
+        wanted = plan(config, trips, one_of(0.0, 0.3, 1.0), generator)
+        found += distances(config, records, wanted, number)
+    assert max(found) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("privacy", "options"),
+    [(CAPPED, {}), (PACED, {}), (CAPPED | {"boundary_inputs": "private"}, {"penetration": 0.5})],
+)
+def test_nobody_pays_for_a_loop_and_no_noise_grows(privacy, options):
+    """Releases, ledgers and account are those without loops; until a reading also estimates."""
+    loops = {"positions": [0.2, 0.5], "ramps": [2], "interval": 20}
+    without, beside = (
+        make_env(privacy=privacy, corridor={"fixed_sensors": [3]}, horizon=60, **options, **more)
+        for more in ({}, {"loops": loops})
+    )
+    for env in (without, beside):
+        env.reset(seed=0, options={"traffic_seed": 0})
+    for second in range(1, 61):
+        told, estimates = [], []
+        for env in (without, beside):
+            process = env.unwrapped.process
+            *_, info = env.step(np.eye(6, dtype=np.int8)[second % 6])
+            private = process.release.private(ONE, process.traffic_index)
+            told.append([process.released, info["spent_mu"], private])
+            estimates.append(process.estimate.density)
+        if second < 20 or privacy != PACED:  # centres and prices follow what is known
+            assert_same(*told)
+        assert np.array_equal(*estimates) == (second < 20)
 
 
 class AtOnce(Pacing):

@@ -18,7 +18,8 @@ from dptse_env.estimators import ESTIMATORS
 from dptse_env.process import TRUTH_INFO
 from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES, PROCESS_SCHEDULES, make_schedule
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.helpers import fast_and_slow
+from tests.helpers import fast_and_slow, record
+from tests.release.worlds import Worlds, alike_to_loops
 
 SEEDS = (0, 1)
 START, STEPS = 250, 30
@@ -183,6 +184,82 @@ def test_vehicles_do_count_and_run_out_meanwhile(preset, what):
 
 def test_what_is_released_of_traffics_does_differ():
     assert unlike(make_private())
+
+
+# --- beside loops ---------------------------------------------------------------------------------
+
+
+LOOPS = {"positions": [0.3], "interval": 7}
+BESIDE_LOOPS = [
+    ("paced", "ekf", "greedy-trace"), ("paced", "recurrent", "expected-reduction"),
+    ("capped", "mhe", "round-robin"), ("paced", "enkf", "stale-variance"),
+    ("printed", "ukf", "speed-front"),
+]  # fmt: skip
+
+
+def make_beside_loops(preset, trips=None, **keywords):
+    """An environment beside a loop, blind, and an episode and a half of traffic of two trips.
+
+    Args:
+        preset: One of `IDS`.
+        trips: Makes places and speeds of either traffic of a corridor, as `alike_to_loops` does.
+        keywords: Of the environment.
+    """
+    road = {"duration": STEPS + STEPS // 2, "incident": None}
+    env = blind(make_private(preset, **{"corridor": road, "loops": LOOPS, **keywords}))
+    corridor = env.unwrapped.config.corridor
+    made = trips(corridor) if trips else alike_to_loops(corridor, 60, np.random.default_rng(0))
+    records = (record(*each, corridor.geometry.n_cells) for each in made)
+    env.unwrapped.process.traffic.library = Worlds(*records, road=corridor)
+    return env
+
+
+@pytest.mark.parametrize(
+    ("preset", "estimator", "schedule"),
+    fast_and_slow(
+        [*BESIDE_LOOPS, *itertools.product(("capped", "paced"), ESTIMATORS, ("round-robin",))],
+        BESIDE_LOOPS,
+    ),
+)
+def test_traffic_with_equal_readings_does_not_show(preset, estimator, schedule):
+    """Vehicles pass the loop in other seconds of an interval, and others are connected."""
+    env = make_beside_loops(preset, estimator=estimator, **(PARTLY if preset == "paced" else {}))
+    assert not unlike(env, schedule)
+    readings = env.unwrapped.process.traffic.readings
+    np.testing.assert_array_equal(*readings)
+    assert np.nanmin(readings[..., 1]) > 0.0 < readings[..., 0].min()
+
+
+def alone(passes):
+    """Places and speeds of a vehicle that passes the loop in second 24, or one that does not."""
+
+    def trips(corridor):
+        seconds = np.arange(corridor.conditions.duration + 1)
+        (face,) = corridor.loops.faces(corridor.geometry).tolist()
+        for place in np.where(seconds < 24, face - 1, face), np.full(seconds.size, face - 1):
+            yield place[None], np.full((1, seconds.size), passes)
+
+    return trips
+
+
+@pytest.mark.parametrize("least_count", [0, 1, 2, 5])
+def test_a_vehicle_alone_shows_unless_its_interval_reports_nothing(least_count):
+    env = make_beside_loops("paced", alone(80.0), loops=LOOPS | {"least_count": least_count})
+    assert unlike(env) == (least_count < 2)
+
+
+def test_a_reading_shows_when_its_interval_has_ended_and_not_before():
+    def trips(corridor):
+        generator, shape = np.random.default_rng(0), (80, corridor.conditions.duration + 1)
+        places = generator.integers(0, corridor.geometry.n_mainline, (2, *shape))
+        places[:, :, :30] = 0  # ahead of the loop, which a vehicle passes once
+        return zip(places, generator.uniform(5.0, 100.0, places.shape), strict=True)
+
+    env = make_beside_loops("paced", trips)
+    first, second = (transcript(env, seed) for seed in SEEDS)
+    # An episode begins in second 15; the interval in which traffic changes ends in second 35.
+    assert same(first[:20], second[:20])
+    assert not same(first[:21], second[:21])
 
 
 # --- what must be caught -------------------------------------------------------------------------

@@ -134,6 +134,27 @@ def adjacent_trips(draw, asked, most_vehicles, n_steps, last_place):
     return places, speeds, other_places, other_speeds
 
 
+def alike_to_loops(corridor, n_vehicles, generator):
+    """Places and speeds (n_vehicles, T + 1) in two worlds that have the same readings of a loop.
+
+    In either world a vehicle passes the loop in the same interval at the same speed, and in
+    another second of it. Otherwise it jumps about on its side of the loop, at any speed.
+    """
+    geometry, interval = corridor.geometry, corridor.loops.interval
+    n, duration = geometry.n_mainline, corridor.conditions.duration
+    (face,) = corridor.loops.faces(geometry).tolist()
+    sides = [*range(face), geometry.n_segments], [*range(face, n), geometry.n_segments + 1]
+    seconds, shape = np.arange(duration + 1), (2, n_vehicles, duration + 1)
+    upstream, downstream = (generator.choice(side, shape) for side in sides)
+    speeds = generator.choice([0.0, 51.0, 150.0, *generator.uniform(0.0, 130.0, 3)], shape)
+    began = interval * generator.integers(0, duration // interval + 1, n_vehicles)
+    passes = (began + generator.integers(1, interval + 1, (2, n_vehicles)))[..., None]
+    places = np.where(seconds < passes, upstream, downstream)
+    passing = generator.uniform(1.0, 130.0, (n_vehicles, 1))
+    speeds = np.where((seconds == passes) | (seconds == passes - 1), passing, speeds)
+    return tuple(zip(places, speeds, strict=True))
+
+
 # --- ledgers under any public numbers -----------------------------------------------------------
 
 
