@@ -1,4 +1,4 @@
-"""Times of a step: estimators, environments, learning and long roads beside their peers.
+"""Times of a step: estimators, environments, learning, long roads and streams beside their peers.
 
 python -m benchmarks --parts estimators
 
@@ -24,7 +24,7 @@ from dptse_env.utils.threads import n_cores
 from dptse_env.versions import versions_with
 from scripts.cli import Command, run
 
-Part = Literal["estimators", "environment", "learning", "long_roads"]
+Part = Literal["estimators", "environment", "learning", "long_roads", "stream"]
 PACKAGES = ("libsumo", "gymnasium", "numba", "numpy", "stable-baselines3")
 
 

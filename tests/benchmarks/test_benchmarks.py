@@ -66,7 +66,8 @@ def test_a_part_that_fails_loses_nothing_of_the_others(tmp_path, monkeypatch, ca
     with pytest.raises(SystemExit, match=r"environment failed"):
         benchmarks.main(benchmarks.Args(output=folder))
     for said in (capsys.readouterr().out, (folder / "tables.md").read_text(encoding="utf-8")):
-        assert re.findall(r"a step of (\w+)", said) == ["estimators", "learning", "long_roads"]
+        parts = ["estimators", "learning", "long_roads", "stream"]
+        assert re.findall(r"a step of (\w+)", said) == parts
 
 
 def test_all_parts_are_one_json_document(monkeypatch, capsys):
@@ -86,7 +87,14 @@ def test_long_roads_have_settings_of_all_estimators():
 def test_all_parts_run_and_write_one_table(tmp_path):
     printed = run("--output", tmp_path)
     written = (tmp_path / "tables.md").read_text(encoding="utf-8")
-    kinds = "EKF, filterpy", "MHE, qpsolvers", "libsumo alone", "road policy", "EKF, 21 segments"
+    kinds = (
+        "EKF, filterpy",
+        "MHE, qpsolvers",
+        "libsumo alone",
+        "road policy",
+        "EKF, 21 segments",
+        "a stream",
+    )
     for name in kinds:
         assert name in printed
         assert name in written
