@@ -24,7 +24,7 @@ from dptse_env.measurement.loops import UNKNOWN
 from dptse_env.measurement.seen import LONGEST, Seen
 from dptse_env.parts import make_model
 from dptse_env.traffic.loops import TOLERANCE
-from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
+from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
 from dptse_env.utils.files import dump_tensors, json_digest, parse_tensors, require_arrays
 from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.validation import convert, integer, require, within
@@ -40,7 +40,9 @@ SPACING = 8
 back costs an eighth of the way at most."""
 N_ROWS = 768
 """Seconds of the stream that are kept. States that are gone back to are 727 s old at most."""
-ALIKE = 9.0
+ALIKE = 3
+"""Seconds of an interval that count as one: the same vehicles are beside a point for so long. For
+filters on the traffic model, which trust their prediction too much, an interval counts once."""
 LATEST = 2**40
 """Largest second of a clock, and minus the smallest one."""
 
@@ -57,7 +59,7 @@ class Entry(NamedTuple):
 
     before: int  # the second before its interval, or before what can still change
     until: int
-    segments: slice
+    cells: IntArray  # segments, and boundary segments beside them if it knows both quantities
     added: FloatArray  # (2, 2) weights 1 / std^2 and weighted values, of density and speed
 
 
@@ -113,6 +115,7 @@ class RoadEstimator:
             own = dataclasses.replace(settings.asm, length=min(max(0.5 * distance, 0.1), 1.0))
             settings = dataclasses.replace(settings, asm=own)
         self._estimator = make_estimator(estimator, "compiled", self.model, 1, settings)
+        self._alike = LONGEST if self._estimator.steps_model else ALIKE
         self.time = self._start = integer("start", start, -LATEST, LATEST)
         self._made_of = {
             "road": json_digest([repr(self.corridor.geometry), self.corridor.digest]),
@@ -123,7 +126,7 @@ class RoadEstimator:
         # What was said last beside the R boundary segments: density, speed, second; never yet.
         self._ends = np.zeros((1, self.model.n_boundaries, 3))
         self._ends[..., 2] = -np.finfo(float).max
-        self._stream = np.zeros((N_ROWS, self.model.n_segments, 2, 2))
+        self._stream = np.zeros((N_ROWS, self.corridor.geometry.n_cells, 2, 2))
         prior = nominal_state(self.corridor, self.model, np.array([0]))
         self._estimator.reset(_ONE, prior, [np.random.default_rng(0)])
         self._kept = {self.time: self._copies()}
@@ -219,10 +222,13 @@ class RoadEstimator:
         weights = [0.0 if std is None else 1.0 / std**2 for _, std in pairs]
         added = [(w, w * (value or 0.0)) for w, (value, _) in zip(weights, pairs, strict=True)]
         before = max(until - each.seconds, oldest)
-        alike = min(each.seconds, ALIKE)
-        return Entry(before, until, self._segments(path, each), np.array(added) / alike)
+        cells, road = self._segments(path, each), self.corridor.road
+        if 0.0 not in weights:
+            at_ends = np.flatnonzero(np.isin(road.beside, cells))
+            cells = np.concatenate([cells, road.n_segments + at_ends])
+        return Entry(before, until, cells, np.array(added) / min(each.seconds, self._alike))
 
-    def _segments(self, path: str, each: Seen) -> slice:
+    def _segments(self, path: str, each: Seen) -> IntArray:
         """Return the segments that a source says something of."""
         faces = [face for face in self._borders if face is not None]
         allowed = f"None or the face of a ramp, {faces}"
@@ -231,28 +237,28 @@ class RoadEstimator:
         for name in ("start", "end"):
             place, allowed = getattr(each, name), f"in 0..{borders[-1]:g} km"
             require(place <= borders[-1] + TOLERANCE, f"{path}.{name}", allowed, place)
-        n = len(borders) - 1
-        if each.start == each.end:
-            face = int(np.abs(borders - each.start).argmin())
-            if abs(borders[face] - each.start) > TOLERANCE:
-                text = f"{each.start:g} km lies within a segment, and counts at its border at"
-                warnings.warn(f"{text} {borders[face]:g} km", UserWarning, stacklevel=1)
-            low, high = max(face - 1, 0), min(face + 1, n)
-        else:
+        n, middle = len(borders) - 1, 0.5 * (each.start + each.end) + TOLERANCE
+        there = min(int(np.searchsorted(borders, middle, "right")) - 1, n - 1)
+        if each.start < each.end:
             middles = 0.5 * (borders[:-1] + borders[1:])
             low, high = np.searchsorted(middles, [each.start, each.end]).tolist()
-            if low == high:  # no middle is covered
-                middle = 0.5 * (each.start + each.end)
-                low = min(int(np.searchsorted(borders, middle, "right")) - 1, n - 1)
-                high = low + 1
-        return slice(first + low, first + high)
+            return first + (np.arange(low, high) if low < high else np.array([there]))
+        face = int(np.abs(borders - each.start).argmin())
+        if each.ramp is None and face in self._borders:  # a ramp changes the traffic there
+            return np.arange(there, there + 1)
+        if abs(borders[face] - each.start) > TOLERANCE:
+            text = f"{each.start:g} km lies within a segment, and counts at its border at"
+            warnings.warn(f"{text} {borders[face]:g} km", UserWarning, stacklevel=1)
+        low, high = max(face - 1, 0), min(face + 1, n)
+        return np.arange(first + low, first + high)
 
     def _go_on(self, now: int, entries: Sequence[Entry]) -> None:
         """Go on to second `now`, from before what has changed."""
         self._stream[np.arange(self.time + 1, now + 1) % N_ROWS] = 0.0
         changed = self.time
-        for before, until, segments, added in entries:
-            self._stream[np.arange(before + 1, until + 1) % N_ROWS, segments] += added
+        for before, until, cells, added in entries:
+            rows = np.arange(before + 1, until + 1) % N_ROWS
+            self._stream[rows[:, None], cells] += added
             changed = min(changed, before)
         back = max(second for second in self._kept if second <= changed)
         if back < self.time:
@@ -279,23 +285,22 @@ class RoadEstimator:
         """Go on by one second, by what was seen in it."""
         weights, totals = np.moveaxis(self._stream[second % N_ROWS], -1, 0)
         known = weights > 0.0
-        values = totals / np.where(known, weights, 1.0)
-        self._estimator.predict(_ONE, self._inputs(second, known, values))
+        values, S = totals / np.where(known, weights, 1.0), self.model.n_segments
+        at_ends = known[S:].all(axis=-1)
+        self._ends[0, at_ends, :2], self._ends[0, at_ends, 2] = values[S:][at_ends], second
+        self._estimator.predict(_ONE, self._inputs(second))
+        weights, known, values = weights[:S], known[:S], values[:S]
         if not known.all():
             x = self._estimator.estimate()
             values = np.where(known, values, np.stack([x.density[0], x.speed[0]], axis=-1))
-        sigma = np.where(known, weights, UNKNOWN**-2) ** -0.5
-        seen = known.any(axis=-1)
-        self._estimator.update(
-            _ONE, Measurement.of(self.model, seen[None], values[None], sigma[None])
-        )
+        sigma, seen = np.where(known, weights, UNKNOWN**-2) ** -0.5, known.any(axis=-1)
+        measured = Measurement.of(self.model, seen[None], values[None], sigma[None])
+        self._estimator.update(_ONE, measured)
         self._estimates[second] = self._estimator.estimate()
 
-    def _inputs(self, second: int, known: BoolArray, values: FloatArray) -> FloatArray:
+    def _inputs(self, second: int) -> FloatArray:
         """Return the model's inputs (1, n_u) of a second."""
         road, before, ends = self.corridor.road, self._estimates[second - 1], self._ends[0]
-        said = known[road.beside].all(axis=-1)
-        ends[said, :2], ends[said, 2] = values[road.beside[said]], second
         fresh = second - ends[:, 2] <= LONGEST
         density = np.where(fresh, ends[:, 0], before.density[:, road.beside])
         speed = np.where(fresh, ends[:, 1], before.speed[:, road.beside])

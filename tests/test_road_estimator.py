@@ -1,6 +1,7 @@
 """A door for a stream of one's own: readings in time or late, gaps, restarts and refusals."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from dptse_env import RoadEstimator, Seen, probes, station
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.measurement.seen import LONGEST
-from dptse_env.road_estimator import N_ROWS
+from dptse_env.road_estimator import ALIKE, N_ROWS
 from dptse_env.utils import files
 from tests.helpers import fast_and_slow
 
@@ -108,9 +109,13 @@ def test_what_nobody_saw_is_as_predicted(estimator):
     ("place", "segments"),
     [
         ((0.0, 0.0, None), [0]),
-        ((0.2, 0.2, None), [1, 2]),
+        ((0.1, 0.1, None), [0, 1]),
+        ((0.2, 0.2, None), [2]),  # where the on-ramp is
+        ((0.1985, 0.1985, None), [1]),
+        ((0.4, 0.4, None), [4]),
         ((0.6, 0.6, None), [5]),
-        ((0.16, 0.16, None), [1, 2]),
+        ((0.26, 0.26, None), [2, 3]),
+        ((0.16, 0.16, None), [1]),
         ((0.1, 0.3, None), [1, 2]),
         ((0.04, 0.16, None), [0, 1]),
         ((0.12, 0.14, None), [1]),
@@ -131,11 +136,11 @@ def test_a_source_says_something_of_the_segments_at_its_place(place, segments):
 
 
 def test_a_point_within_a_segment_is_said_to_count_at_its_border():
-    with pytest.warns(UserWarning, match=r"^0\.16 km lies .* counts at its border at 0\.2 km$"):
-        make().step(loops(0, borders=[0.16]), seconds=60)
+    with pytest.warns(UserWarning, match=r"^0\.26 km lies .* counts at its border at 0\.3 km$"):
+        make().step(loops(0, borders=[0.26]), seconds=60)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        make().step(loops(0, borders=[0.2004]), seconds=60)
+        make().step(loops(0, borders=[0.16, 0.3004]), seconds=60)
 
 
 def test_what_is_said_at_an_end_enters_there_until_it_is_ten_minutes_old():
@@ -147,6 +152,24 @@ def test_what_is_said_at_an_end_enters_there_until_it_is_ten_minutes_old():
     for road in (said, none):
         road.step(seconds=LONGEST)
     np.testing.assert_allclose(bits(said)[0], bits(none)[0], atol=0.1)
+
+
+def test_speeds_alone_say_nothing_of_what_enters():
+    road, blind = make("open_loop"), make("open_loop")
+    road.step([probes(0.0, 0.6, 20.0, vehicles=9, seconds=1)])
+    blind.step()
+    for each in (road, blind):
+        each.step(seconds=60)
+    assert (bits(road) == bits(blind)).all()
+
+
+@pytest.mark.parametrize(("estimator", "once"), [("random_walk", False), ("open_loop", True)])
+def test_an_interval_counts_once_for_filters_on_the_traffic_model(estimator, once):
+    road = make(estimator)
+    reading = Seen(0.0, 0.1, 40.0, 80.0, 2.0, 4.0, seconds=60)
+    weight = road._entry("", reading, 60).added[0, 0]
+    assert weight == pytest.approx(0.25 / (60 if once else ALIKE))
+    assert road._entry("", replace(reading, seconds=1), 60).added[0, 0] == 0.25
 
 
 def test_nobody_says_anything_for_two_hours():

@@ -31,8 +31,9 @@ class Seen:
 
     Attributes:
         start: Where it begins [km], from the upstream end of the mainline, or of its ramp.
-        end: Where it ends [km]. A point counts at the nearest border of two segments, for both;
-            other parts for the segments whose middle they cover.
+        end: Where it ends [km]. A point counts at the nearest border of two segments, for both, or
+            where a ramp is for the one that it lies on. A part of the road counts for the segments
+            whose middle it covers.
         density: Density of all lanes [veh/km]; None where it is not known.
         speed: Mean speed [km/h]; None where it is not known.
         density_std: Standard deviation of the density, for any second [veh/km].
