@@ -39,7 +39,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     .slices`` has the place of each. The scales are constants of the corridor: of densities
     ``corridor.density_scale`` (111 veh/km for each lane on the roads that ship), of speeds
     ``corridor.speed_scale`` (their speed limit, 102 km/h), of flows the product of both. Values
-    beyond the bounds are clipped. Nothing in it shows the true traffic or the time.
+    beyond the bounds are clipped. Nothing in it shows the true traffic or the time, but for what
+    loops report and how long ago that was.
 
     | block                    | size | value                                          | bounds    |
     | :--                      | :--  | :--                                            | :--       |
@@ -61,11 +62,16 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | picked                   | G    | whether it is picked for the step to come      | [0, 1]    |
     | last_price               | G    | log10(price of the last query) / 2, 0 before   | [-5, 5]   |
     | spent_share              | n    | mean charge of a vehicle there [its budget]    | [0, 1]    |
+    | loop_flow                | L    | last flow at a loop [scale], -1 unknown        | [-1, 4]   |
+    | loop_speed               | L    | last mean speed at a loop [scale], -1 unknown  | [-1, 4]   |
+    | loop_age                 | 1    | age of these readings [interval]               | [0, 1]    |
+    | loop_position            | L    | place of a loop [length of the mainline]       | [0, 1]    |
 
     Either ``released_speed`` or ``released_flow`` is there, whichever the release model releases,
     ``picked`` under ``action="sequential"``, ``last_price`` and ``spent_share`` under release
-    models with prices. Innovations are 0 where nothing was observed. ``observation`` chooses other
-    blocks.
+    models with prices, and those of ``loop_`` on a road with L loops. These say -1 before the first
+    reading, where fewer vehicles passed than a loop reports, and of the speed where none did.
+    Innovations are 0 where nothing was observed. ``observation`` chooses other blocks.
 
     **Action**: ``action`` chooses the encoding; a sampled action never raises. B is the largest
     number of queries that the bandwidth pays for.
@@ -144,6 +150,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `truth_in_info`      | False           | whether `info` shows the true traffic               |
     | `epsilon`            | 1.0             | short for `privacy`'s                               |
     | `delta`              | 0.05            | short for `privacy`'s                               |
+    | `loops`              | None            | short for `corridor`'s: loop detectors, a mapping   |
     | `incident`           | "preset"        | short for `corridor`'s; `random`, `none`, a mapping |
     | `demand`             | "preset"        | short for `corridor`'s; `random`, a mapping         |
     | `render_mode`        | None            | or `rgb_array` (extra `plot`), `human` (`video`)    |

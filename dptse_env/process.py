@@ -354,7 +354,11 @@ class QueryProcess:
         return self._observed(episodes, self.estimate.at(episodes))
 
     def _observed(self, episodes: IntArray, estimate: Estimate) -> Observation:
-        public = self.release.public(episodes)
+        public, readings, reading_age = self.release.public(episodes), None, None
+        if self.loops is not None:
+            times = self.time[episodes]
+            readings = self.loops.last(self.traffic_index[episodes], times)
+            reading_age = times % self.loops.interval
         state = PublicState(
             estimate=estimate,
             released=self.released.take(episodes, 0),
@@ -364,6 +368,8 @@ class QueryProcess:
             picked=self.pending.picked.take(episodes, 0),
             prices=public.get("prices"),
             spent_share=public.get("spent_share"),
+            readings=readings,
+            reading_age=reading_age,
         )
         return self.interface.observations.encode(state)
 

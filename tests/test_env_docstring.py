@@ -40,10 +40,13 @@ def test_its_table_of_blocks_is_that_of_the_code():
     assert [ast.literal_eval(row[3]) for row in rows] == [[b.low, b.high] for b in BLOCKS.values()]
 
 
-@pytest.mark.parametrize("keywords", [{}, {"privacy": "paced", "action": "sequential"}])
+@pytest.mark.parametrize(
+    "keywords",
+    [{}, {"privacy": "paced", "action": "sequential", "loops": {"positions": [0.0, 0.5]}}],
+)
 def test_its_sizes_of_blocks_are_those_of_observations(keywords):
     interface = gym.make(PAPER, **keywords).unwrapped.interface
-    sizes = {"S": 19, "n": 15, "G": 15, "F": 3, "1": 1}
+    sizes = {"S": 19, "n": 15, "G": 15, "F": 3, "L": 2, "1": 1}
     expected = {row[0]: sizes[row[1]] for row in table("block")}
     for left_out in {*expected} - {*interface.observations.slices}:
         del expected[left_out]

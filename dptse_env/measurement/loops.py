@@ -76,6 +76,13 @@ class LoopReadings:
         found: FloatArray = self._traffic.readings[traffic, interval]
         return found
 
+    def last(self, traffic: IntArray, times: IntArray) -> FloatArray:
+        """Return last readings (k, F, 2) at seconds of the record (k,), NaN before the first."""
+        interval = times // self.interval - 1
+        found, some = np.full((len(times), len(self.stations.beside), 2), np.nan), interval >= 0
+        found[some] = self.read(traffic[some], interval[some])
+        return found
+
     def said(self, read: FloatArray) -> Said:
         """Return what readings (k, F, 2) say: density q / v and speed.
 

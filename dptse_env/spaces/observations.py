@@ -3,7 +3,8 @@
 It consists of named blocks, each with fixed bounds and scaled by physical constants of the
 corridor, so there are no running statistics that could be lost between training and use. It has
 released values, the estimator's output, the query history and public settings, but neither the
-truth, nor a clock, nor anything that distinguishes an empty segment from an occupied one.
+truth, nor a clock, nor anything that distinguishes an empty segment from an occupied one; except
+for loops, whose readings are public, and come at the ends of intervals.
 """
 
 from __future__ import annotations
@@ -18,14 +19,19 @@ from gymnasium import spaces
 
 from dptse_env.estimators import Estimate
 from dptse_env.release import Task
+from dptse_env.traffic.loops import Stations, borders_of
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
+from dptse_env.utils.units import HOUR
 
 AGE_CAP = 60
 """Largest age of a segment [s] that observations distinguish."""
 
 PRICE_UNIT = 2.0
 """Unit of the logarithm of prices that makes observations of them of order one."""
+
+NOT_REPORTED = -1
+"""Flow or speed of a loop that has not reported any."""
 
 DEFAULT = "default"
 """Name that stands for all default blocks."""
@@ -48,6 +54,10 @@ class PublicState(NamedTuple):
         spent_share: The release model's public account of what a vehicle on each mainline segment
             has been charged on average, over its budget, in [0, 1], shape (k, n_mainline). None
             where queries have no prices.
+        readings: What each of the F stations of loops reported last, the number of vehicles and
+            their mean speed [km/h], NaN where it is not known, shape (k, F, 2). None where there
+            are no loops.
+        reading_age: Seconds since the interval of these readings ended, shape (k,).
     """
 
     estimate: Estimate
@@ -58,6 +68,8 @@ class PublicState(NamedTuple):
     picked: BoolArray
     prices: FloatArray | None = None
     spent_share: FloatArray | None = None
+    readings: FloatArray | None = None
+    reading_age: IntArray | None = None
 
 
 class ObservationBlock(Protocol):
@@ -96,7 +108,7 @@ class Block:
         field: Attribute of `PublicState`, such as ``"estimate.speed"``; empty for a constant.
         unit: Unit of the values.
         part: Index into the field; None for all of it.
-        constant: The value where there is no field, or while it is None.
+        constant: The value, or values, where there is no field, or while it is None.
         transform: Makes values of the field and the unit, in place of their quotient.
         is_default: Whether the default observation has it, by the task and by whether actions pick
             one by one.
@@ -109,7 +121,7 @@ class Block:
     field: str
     unit: Callable[[Task], float] = lambda task: 1.0
     part: Callable[[Task], Any] | None = None
-    constant: Callable[[Task], float] = lambda task: 0.0
+    constant: Callable[[Task], float | FloatArray] = lambda task: 0.0
     transform: Transform | None = None
     is_default: Callable[[Task, bool], bool] = lambda task, one_by_one: True
 
@@ -157,6 +169,33 @@ def _of_sensors(component: int) -> Callable[[Task], Any]:
     return lambda task: (slice(None), task.sensors, component)
 
 
+def _stations(task: Task) -> Stations | None:
+    loops, geometry = task.corridor.loops, task.corridor.geometry
+    return None if loops is None else Stations.of(loops, geometry)
+
+
+def _loops(task: Task) -> int:
+    stations = _stations(task)
+    return 0 if stations is None else len(stations.positions)
+
+
+def _interval(task: Task) -> int:
+    return 1 if task.corridor.loops is None else task.corridor.loops.interval
+
+
+def _has_loops(task: Task, _: bool) -> bool:
+    return task.corridor.loops is not None
+
+
+def _places(task: Task) -> FloatArray:
+    stations, geometry = _stations(task), task.corridor.geometry
+    return np.zeros(0) if stations is None else stations.positions / borders_of(geometry)[-1]
+
+
+def _known(values: FloatArray, unit: float) -> FloatArray:
+    return np.where(np.isfinite(values), values / unit, NOT_REPORTED)
+
+
 def _log(values: FloatArray, unit: float) -> FloatArray:
     # Zero has no logarithm; that of the smallest number is clipped to the lower bound.
     return np.log(np.maximum(values / unit, _TINY))
@@ -192,6 +231,14 @@ SHIPPED_BLOCKS = (
           is_default=lambda task, _: task.has_prices),
     Block("spent_share", _mainline, 0, 1, "spent_share",
           is_default=lambda task, _: task.has_prices),
+    Block("loop_flow", _loops, NOT_REPORTED, 4, "readings",
+          lambda task: _flow_scale(task) * _interval(task) / HOUR,
+          lambda task: (slice(None), slice(None), 0), transform=_known, is_default=_has_loops),
+    Block("loop_speed", _loops, NOT_REPORTED, 4, "readings", _speed_scale,
+          lambda task: (slice(None), slice(None), 1), transform=_known, is_default=_has_loops),
+    Block("loop_age", lambda _: 1, 0, 1, "reading_age", _interval,
+          lambda task: (slice(None), None), is_default=_has_loops),
+    Block("loop_position", _loops, 0, 1, "", constant=_places, is_default=_has_loops),
 )  # fmt: skip
 """The shipped blocks; the default observation has those that are in it, in this order."""
 

@@ -112,6 +112,7 @@ class Stations(NamedTuple):
     beside: IntArray  # (F, 2) segments with the same flow; one stands twice where it is alone
     enters: IntArray  # (F,) the first segment where vehicles come into the road, -1 elsewhere
     leaves: IntArray  # (F,) the last segment where they leave it, -1 elsewhere
+    positions: FloatArray  # (F,) along the mainline [km]; of a ramp where it meets it
 
     @classmethod
     def of(cls, loops: Loops, geometry: Geometry) -> Self:
@@ -150,4 +151,5 @@ class Stations(NamedTuple):
             np.array(beside, dtype=np.int64).reshape(-1, 2),
             np.where(ends == 0, 0, -1),
             np.where(ends == n, n - 1, -1),
+            borders_of(geometry)[[*faces, *(face for face, *_ in ramps)]],
         )

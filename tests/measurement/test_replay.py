@@ -137,6 +137,29 @@ def test_a_filter_that_starts_over_in_a_replay_says_so():
     assert np.isfinite(process.estimate.density).all()
 
 
+def test_an_observation_has_the_last_readings_also_those_before_the_episode():
+    process = begun()
+    encoding, corridor = process.interface.observations, process.config.corridor
+    unit = corridor.scales.density_scale * corridor.scales.speed_scale * T / 3600.0
+    outcome = process.observe(ALL)
+    for action in sampled(process, 15):
+        for e, time in enumerate(process.time.tolist()):
+            shown = {
+                name: encoding.block(outcome[e], name)
+                for name in ("loop_flow", "loop_speed", "loop_age")
+            }
+            np.testing.assert_allclose(shown["loop_age"], [time % T / T])
+            flow, speed = np.full((2, 4), -1.0)
+            if time >= T:
+                record = process.traffic_index[e]
+                count, mean = process.traffic.readings[record, time // T - 1].T
+                flow = np.where(np.isfinite(count), count / unit, -1.0)
+                speed = np.where(count > 0, mean / corridor.scales.speed_scale, -1.0)
+            np.testing.assert_allclose(shown["loop_flow"], flow, rtol=1e-6)
+            np.testing.assert_allclose(shown["loop_speed"], speed, rtol=1e-6)
+        outcome = process.step(ALL, action).observation
+
+
 # --- batches --------------------------------------------------------------------------------------
 
 

@@ -1,5 +1,7 @@
 """Blocks of observations: their values, scales and order."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from dptse_env.spaces.observations import (
     ObservationEncoding,
     PublicState,
 )
-from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Scales
+from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Loops, Scales
 from tests.helpers import SumRelease
 from tests.release.worlds import task_of
 
@@ -89,6 +91,32 @@ def test_a_released_flow_has_its_own_name_and_scale():
     observation = encoder.encode(shown)
     np.testing.assert_allclose(encoder.block(observation, "released_flow"), [[-0.5] * N] * 2)
     np.testing.assert_allclose(encoder.block(observation, "epsilon"), np.log10(5.0), rtol=1e-6)
+
+
+def test_loops_show_what_they_reported_last_and_where_they_stand():
+    loops = Loops(positions=(0.0, 0.2, 0.4), ramps=(1,), interval=30)
+    road = replace(ROAD, loops=loops)
+    task = task_of(Corrected, PrivacySettings(epsilon=0.1), road, Queries.make(N, 2))
+    encoder, plain = ObservationEncoding(task), encoding()
+    assert [*encoder.slices][len(plain.slices) :] == [
+        "loop_flow", "loop_speed", "loop_age", "loop_position"
+    ]  # fmt: skip
+    reported = [[10.0, 25.0], [0.0, np.nan], [np.nan, np.nan], [1e6, 1e6]]
+    shown = state()._replace(readings=np.array([reported] * 2), reading_age=np.array([0, 15]))
+    observation = encoder.encode(shown)
+    assert encoder.space.contains(observation[0])
+    for name, values in {
+        "loop_flow": [[1200.0 / 5000.0, 0.0, -1.0, 4.0]] * 2,
+        "loop_speed": [[0.5, -1.0, -1.0, 4.0]] * 2,
+        "loop_age": [[0.0], [0.5]],
+        "loop_position": [[0.0, 0.5, 1.0, 0.25]] * 2,
+    }.items():
+        block = encoder.block(observation, name)
+        np.testing.assert_allclose(block, values, rtol=1e-6, err_msg=name)
+    size = plain.space.shape[0]
+    np.testing.assert_array_equal(observation[:, :size], plain.encode(state()))
+    chosen = encoding(["loop_flow", "loop_speed", "loop_age", "loop_position", "age"])
+    assert chosen.encode(state()).shape == (2, 1 + N)
 
 
 def test_blocks_can_be_chosen_in_any_order_and_stand_once():
