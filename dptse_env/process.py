@@ -162,8 +162,9 @@ class QueryProcess:
         """Return a copy that can be stepped to look ahead, with the same streams of noise.
 
         A fork that is stepped like its origin gives the same bits, and the origin is not affected.
-        It shares traffic and model and cannot be reset. One of a single episode takes some 0.6 ms
-        to make, one of 64 some 70 us an episode.
+        So it reads releases and loops of seconds to come: only oracles, and training on recorded
+        traffic, may act on what it finds. It shares traffic and model and cannot be reset. One of a
+        single episode takes some 0.6 ms to make, one of 64 some 70 us an episode.
 
         Raises:
             RuntimeError: The noise is secure: two releases with the same noise have no guarantee.
@@ -171,7 +172,7 @@ class QueryProcess:
         if self.config.privacy.noise == "secure":
             raise RuntimeError("a process whose privacy.noise is 'secure' has no forks")
         shared = (
-            self.config, self.interface, self.model, self.traffic, self._threads,
+            self.config, self.interface, self.model, self.traffic, self.loops, self._threads,
             self.release.task, *self.boundary.shared,
         )  # fmt: skip
         fork = copy.deepcopy(self, {id(item): item for item in shared})

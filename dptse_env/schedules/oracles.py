@@ -77,7 +77,8 @@ class OracleGain(ProcessSchedule):
         """Return the rewards of querying each segment by itself, shape (k, n_mainline)."""
         ahead, n = self.process.fork(), self.n_mainline
         traffic, times = ahead.traffic_index[episodes], ahead.time[episodes]
-        ahead.estimator.predict(episodes, ahead.boundary.inputs(episodes, traffic, times))
+        inputs = ahead.boundary.inputs(episodes, traffic, times)
+        ahead.estimator.predict(episodes, inputs)
         every_column = np.ones((len(episodes), ahead.release.task.n_channels), dtype=bool)
         ahead.release.give_noise(np.zeros((ahead.n_episodes, every_column.shape[1], 2)))
         prediction = ahead.estimator.estimate().at(episodes)
@@ -85,14 +86,19 @@ class OracleGain(ProcessSchedule):
         measured = ahead.measure(request)
         truth = ahead.traffic.aggregates(traffic, times + 1)[:, :n]
         density, speed = truth[..., 0], truth[..., 1]
-        model = getattr(ahead.estimator, "model", None)
+        shared = [ahead.estimator.model, *(ahead.replay.shared if ahead.replay else ())]
         rewards = np.empty((len(episodes), n))
         for segment in range(n):
             queried = np.zeros((len(episodes), n), dtype=bool)
             queried[:, segment] = True
             seen = ahead.release.task.observed(queried) & measured.observed
-            estimator = copy.deepcopy(ahead.estimator, {id(model): model})
-            estimator.update(episodes, measured._replace(observed=seen))
+            estimator, replay = copy.deepcopy(
+                (ahead.estimator, ahead.replay), {id(part): part for part in shared}
+            )
+            given = measured._replace(observed=seen)
+            estimator.update(episodes, given)
+            if replay is not None:
+                replay.follow(episodes, traffic, times + 1, inputs, given)
             estimate = estimator.estimate().at(episodes)
             error = estimation_error(density, speed, estimate.density[:, :n], estimate.speed[:, :n])
             rewards[:, segment] = self.interface.reward(

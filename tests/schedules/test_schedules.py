@@ -150,6 +150,7 @@ def test_the_oracle_of_errors_asks_where_the_estimate_is_worst(reward):
 @pytest.mark.parametrize("keywords", [
     {"privacy": "printed", "estimator": "enkf"}, {"privacy": PAID},
     {"estimator": "random_walk", "reward": "speed"}, {"estimator": "ekf", "backend": "reference"},
+    {"loops": {"positions": [0.0, 0.3], "interval": 3}},
 ], ids=str)  # fmt: skip
 def test_the_oracle_of_gains_asks_what_forks_without_noise_find_best(keywords):
     env = make_batch(**keywords)
