@@ -52,6 +52,7 @@ class Filters(NamedTuple):
     initial_variance: FloatArray  # (n_x,) normalised
     process_variance: FloatArray  # (n_x,) normalised, of a step
     growth_variance: float  # variance that rho / rho_m = 1 adds to the process noise of rho
+    vehicle_variance: FloatArray  # (2,) that it adds by vehicles with the others' w, and to psi
     count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
     is_box: bool  # whether means are projected into the paper's box, not the cone
 
@@ -78,6 +79,7 @@ class CovarianceFilter(KernelEstimator):
             initial_variance=initial_variance(model, settings),
             process_variance=process_variance(model, settings),
             growth_variance=float(settings.density_growth) ** 2,
+            vehicle_variance=np.square(settings.vehicle_noise),
             count_variance=count_variance(model, settings),
             is_box=settings.bounds == "box",
         )
@@ -130,26 +132,47 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict one step ahead under inputs `(k, n_u)`."""
     road, arz, _, filters = bundle.parts
     scratch, noise = make_scratch(road), np.empty(filters.units.size)
+    slopes = np.empty(road.n_segments)
     blocks = np.empty((*road.neighbours.shape, 4))
     work = np.empty((2, *filters.covariances.shape[1:]))
     for k in range(episodes.size):
         mean, covariance = filters.means[episodes[k]], filters.covariances[episodes[k]]
-        process_noise(road, filters, mean, noise)
+        process_noise(road, filters, mean, noise, slopes)
         # x = f(x, u) and A = df/dx
         advance(road, arz, mean, inputs[k], mean, blocks, scratch)
         project(road, arz, mean, filters.is_box)
         normalise(arz, filters.units[0], blocks, scratch.by_factor)
         # P = A P A' + Q
         mirror(covariance)
-        propagate(road, blocks, scratch.by_factor, noise, covariance, work, covariance)
+        propagate(road, blocks, scratch.by_factor, noise, slopes, covariance, work, covariance)
 
 
 @kernel_part
-def process_noise(road: Road, filters: Filters, mean: FloatArray, variance: FloatArray) -> None:
-    """Write the variances `(n_x,)` of the process noise of a step that leaves a mean `(n_x,)`."""
+def process_noise(
+    road: Road, filters: Filters, mean: FloatArray, variance: FloatArray, slopes: FloatArray
+) -> None:
+    """Write the process noise of a step that leaves a mean `(n_x,)`, as `add_noise` takes it.
+
+    Args:
+        road: The road.
+        filters: The filters.
+        mean: The mean.
+        variance: `(n_x,)`, written.
+        slopes: `(S,)`, written.
+    """
     copy_vector(filters.process_variance, variance)
+    of_vehicles, of_psi = filters.vehicle_variance[0], filters.vehicle_variance[1]
     for s in range(road.n_segments):
-        variance[2 * s] += filters.growth_variance * mean[2 * s] / filters.units[2 * s]
+        i, j = 2 * s, 2 * s + 1
+        variance[i] += filters.growth_variance * mean[i] / filters.units[i]
+        slopes[s], rho = 0.0, mean[i] / filters.units[i]
+        if (of_vehicles > 0.0 or of_psi > 0.0) and rho > 0.0:
+            # The sum of [[c, 0], [0, d]], of a rho [[1, w], [w, w^2]] and of [[0, 0], [0, b rho]].
+            w = min(mean[j] / filters.units[j] / rho, LARGEST_W)
+            alone, brought = variance[i], of_vehicles * rho
+            variance[i] = alone + brought
+            slopes[s] = w * brought / variance[i]
+            variance[j] += of_psi * rho + w * slopes[s] * alone
 
 
 @kernel

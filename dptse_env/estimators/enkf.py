@@ -50,6 +50,7 @@ class Ensembles(NamedTuple):
     diverged: BoolArray  # (n,)
     process_deviation: FloatArray  # (n_x,) of a step [veh/km, veh/h, 1]
     density_growth: float  # deviation over rho_m that rho = rho_m adds to the noise of rho
+    vehicle_noise: FloatArray  # (2,) by vehicles with the others' w, and of psi over rho_m v_f
     count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
     initial_deviation: FloatArray  # (n_x,) of the members around a prior [veh/km, veh/h, 1]
     density_scale: float  # rho_m [veh/km]
@@ -118,17 +119,26 @@ def _restart(road: Road, arz: ARZ, ensembles: Ensembles, e: int) -> None:
     for i in range(members.shape[0]):
         members[i] = ensembles.priors[e, i]
     draws = draw(ensembles.streams[e, 0], members.shape[0] * n)
-    _perturb(members, n, ensembles.initial_deviation, draws)
+    _perturb(members, n, ensembles.initial_deviation, np.empty(0), draws)
     project_states(road, arz, members, ensembles.is_box)
 
 
 @kernel_part
-def _perturb(members: FloatArray, n: int, deviation: FloatArray, draws: Draws) -> None:
-    """Add noise to the first n columns; those beyond repeat the first."""
+def _perturb(
+    members: FloatArray, n: int, deviation: FloatArray, slopes: FloatArray, draws: Draws
+) -> None:
+    """Add noise to the first n columns; those beyond repeat the first.
+
+    Slopes, of psi's noise by rho's, are none or those of all segments [km/h].
+    """
     for i in range(members.shape[0]):
         row, drawn, size = members[i], draws[i * n : (i + 1) * n], deviation[i]
         for j in range(n):
             row[j] += size * drawn[j]
+        if i % 2 == 1 and i // 2 < slopes.size and slopes[i // 2] != 0.0:
+            drawn, size = draws[(i - 1) * n : i * n], slopes[i // 2] * deviation[i - 1]
+            for j in range(n):
+                row[j] += size * drawn[j]
         row[n:] = row[0]
 
 
@@ -138,28 +148,53 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     road, arz, _, ensembles = bundle.parts
     size, width = ensembles.members.shape[1:]
     scratch, deviation = make_batch_scratch(road, width), np.empty(size)
+    slopes = np.empty(road.n_segments)
     for k in range(episodes.size):
         members = ensembles.members[episodes[k]]
-        _process_deviation(road, ensembles, members, deviation)
+        _process_deviation(road, arz, ensembles, members, deviation, slopes)
         advance_states(road, arz, members, inputs[k], scratch)
         draws = draw(ensembles.streams[episodes[k], 0], size * ensembles.n_members)
-        _perturb(members, ensembles.n_members, deviation, draws)
+        _perturb(members, ensembles.n_members, deviation, slopes, draws)
         project_states(road, arz, members, ensembles.is_box)
 
 
 @kernel_part
 def _process_deviation(
-    road: Road, ensembles: Ensembles, members: FloatArray, deviation: FloatArray
+    road: Road,
+    arz: ARZ,
+    ensembles: Ensembles,
+    members: FloatArray,
+    deviation: FloatArray,
+    slopes: FloatArray,
 ) -> None:
-    """Write the deviations `(n_x,)` of the process noise of a step that leaves the members."""
+    """Write the process noise of a step that leaves the members.
+
+    Args:
+        road: The road.
+        arz: The model.
+        ensembles: The ensembles.
+        members: `(n_x, width)`.
+        deviation: `(n_x,)`, written with the deviations of rho, and of psi beside its slope.
+        slopes: `(S,)`, written with those of psi's noise by rho's [km/h].
+    """
     copy_vector(ensembles.process_deviation, deviation)
-    if ensembles.density_growth == 0.0:
-        return
-    scale = ensembles.density_scale
+    scale, n, noise = ensembles.density_scale, ensembles.n_members, ensembles.vehicle_noise
     for s in range(road.n_segments):
-        share = mean_of(members[2 * s], ensembles.n_members) / scale
-        grown = (ensembles.density_growth * scale) ** 2 * share
-        deviation[2 * s] = np.sqrt(deviation[2 * s] ** 2 + grown)
+        i, j = 2 * s, 2 * s + 1
+        slopes[s] = 0.0
+        if ensembles.density_growth > 0.0:
+            share = mean_of(members[i], n) / scale
+            grown = (ensembles.density_growth * scale) ** 2 * share
+            deviation[i] = np.sqrt(deviation[i] ** 2 + grown)
+        rho = mean_of(members[i], n)
+        if (noise[0] > 0.0 or noise[1] > 0.0) and rho > 0.0:  # as for the EKF, `process_noise`
+            w = min(mean_of(members[j], n) / rho, LARGEST_W * arz.free_flow_speed)
+            share = rho / scale
+            alone, brought = deviation[i] ** 2, (noise[0] * scale) ** 2 * share
+            deviation[i] = np.sqrt(alone + brought)
+            slopes[s] = w * brought / (alone + brought)
+            own = (noise[1] * scale * arz.free_flow_speed) ** 2 * share + w * slopes[s] * alone
+            deviation[j] = np.sqrt(deviation[j] ** 2 + own)
 
 
 @kernel
@@ -384,6 +419,7 @@ class EnKF(KernelEstimator):
             diverged=self.diverged,
             process_deviation=np.sqrt(process_variance(model, settings)) * model.state_scale,
             density_growth=float(settings.density_growth),
+            vehicle_noise=np.array(settings.vehicle_noise),
             count_variance=count_variance(model, settings),
             initial_deviation=np.sqrt(initial_variance(model, settings)) * model.state_scale,
             density_scale=model.density_scale,

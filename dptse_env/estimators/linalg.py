@@ -130,6 +130,7 @@ def propagate(
     blocks: FloatArray,
     by_factor: FloatArray,
     noise: FloatArray,
+    slopes: FloatArray,
     covariance: FloatArray,
     scratch: FloatArray,
     out: FloatArray,
@@ -140,7 +141,8 @@ def propagate(
         road: The road, for the cells of the blocks.
         blocks: `(S, K, 4)` blocks of A.
         by_factor: `(E, 2)` derivatives by the demand factors.
-        noise: `(n_x,)` variances that Q adds.
+        noise: `(n_x,)` variances of Q; see `add_noise`.
+        slopes: `(S,)` slopes of Q.
         covariance: `(n_x, padded)` P, of which both halves are read.
         scratch: `(2, n_x, padded)`.
         out: `(n_x, padded)`, its padding zero.
@@ -153,8 +155,37 @@ def propagate(
         for j in range(n, transposed.shape[1]):
             transposed[i, j] = 0.0
     multiply(road, blocks, by_factor, transposed, out, True)
-    for i in range(n):
-        out[i, i] += noise[i]
+    add_noise(noise, slopes, out)
+
+
+@kernel_part
+def add_noise(noise: FloatArray, slopes: FloatArray, covariance: FloatArray) -> None:
+    """Add Q = L D L' to a covariance, in which segments are independent.
+
+    Args:
+        noise: `(n_x,)` D, the variances of rho's noise and of what psi's has beside it.
+        slopes: `(S,)` of psi's noise by rho's: a segment has the block [[1, 0], [slope, 1]] of L.
+        covariance: `(n_x, padded)`.
+    """
+    for i in range(covariance.shape[0]):
+        covariance[i, i] += noise[i]
+    for s in range(slopes.size):
+        i, j = 2 * s, 2 * s + 1
+        joint = slopes[s] * noise[i]
+        covariance[j, i] += joint
+        covariance[i, j] += joint
+        covariance[j, j] += slopes[s] * joint
+
+
+@kernel_part
+def divide_by_noise(noise: FloatArray, slopes: FloatArray, x: FloatArray) -> None:
+    """Replace a vector `(>= n_x,)` by Q^-1 x; see `add_noise`."""
+    for s in range(slopes.size):
+        x[2 * s + 1] -= slopes[s] * x[2 * s]
+    for i in range(noise.size):
+        x[i] /= noise[i]
+    for s in range(slopes.size):
+        x[2 * s] -= slopes[s] * x[2 * s + 1]
 
 
 @kernel_part(fastmath={"contract"})

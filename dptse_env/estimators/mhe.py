@@ -71,6 +71,7 @@ class Windows(NamedTuple):
     predicted: FloatArray  # (n, L, n_x) predictions of stages; the first is the arrival's mean
     inputs: FloatArray  # (n, L, n_u) of the step that leaves each stage
     process_variance: FloatArray  # (n, L, n_x) likewise
+    slopes: FloatArray  # (n, L, S) likewise
     blocks: FloatArray  # (n, L, S, K, 4) likewise
     by_factor: FloatArray  # (n, L, E, 2) likewise, of the demand factors; E = 0 without
     offsets: FloatArray  # (n, L, n_x) likewise
@@ -125,6 +126,7 @@ def _shift(windows: Windows, e: int) -> None:
     _drop(windows.predicted[e].reshape(n_stages, -1))
     _drop(windows.inputs[e].reshape(n_stages, -1))
     _drop(windows.process_variance[e].reshape(n_stages, -1))
+    _drop(windows.slopes[e].reshape(n_stages, -1))
     _drop(windows.blocks[e].reshape(n_stages, -1))
     _drop(windows.by_factor[e].reshape(n_stages, -1))
     _drop(windows.offsets[e].reshape(n_stages, -1))
@@ -160,7 +162,8 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
             for i in range(point.size):
                 point[i] += windows.solution[e, t, i] / length
         copy_vector(filters.means[e], state)
-        process_noise(road, filters, state, windows.process_variance[e, length - 1])
+        variance, slopes = windows.process_variance[e, length - 1], windows.slopes[e, length - 1]
+        process_noise(road, filters, state, variance, slopes)
         project(road, arz, state, False)
         advance(road, arz, state, inputs[k], state, blocks, scratch)
         project(road, arz, state, filters.is_box)
@@ -339,6 +342,7 @@ def window_of(windows: Windows, e: int) -> Window:
         windows.by_factor[e, :length],
         windows.offsets[e, :length],
         windows.process_variance[e, :length],
+        windows.slopes[e, :length],
         windows.observed[e, :length],
         windows.weights[e, :length],
         windows.targets[e, :length],
@@ -431,6 +435,7 @@ def _allocate(model: ARZModel, settings: EstimatorSettings, fallback: BoolArray)
         predicted=np.zeros((*shape, n)),
         inputs=np.zeros((*shape, model.n_inputs)),
         process_variance=np.ones((*shape, n)),
+        slopes=np.zeros((*shape, model.n_segments)),
         blocks=np.zeros((*shape, *model.road.neighbours.shape, 4)),
         by_factor=np.zeros((*shape, model.n_demand_states, 2)),
         offsets=np.zeros((*shape, n)),

@@ -30,7 +30,7 @@ from dptse_env.estimators.normals import draw, make_stream
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.window import AT_BOUND
 from dptse_env.model import ARZModel
-from dptse_env.model.parameters import Bounds
+from dptse_env.model.parameters import LARGEST_W, Bounds
 from dptse_env.utils.arrays import FloatArray, IntArray
 from dptse_env.utils.registry import needed_for
 
@@ -84,11 +84,21 @@ class Problem:
         return np.asarray(jacobian * self.unit / self.unit[:, None])
 
     def Q(self, x: FloatArray) -> FloatArray:  # noqa: N802
-        """Return the variances `(n_x,)` of the noise of a step that leaves a mean."""
-        variance = self._process_variance.copy()
-        grown = self.settings.density_growth**2 * self._density(x) / self.model.density_scale
-        variance[0 : 2 * self.model.n_segments : 2] += grown
-        return variance
+        """Return the covariance `(n_x, n_x)` of the noise of a step that leaves a mean."""
+        rho = self._density(x) / self.model.density_scale
+        psi = self.project(x[None])[0, 1 : 2 * len(rho) : 2]
+        w = np.minimum(psi / np.where(rho > 0.0, rho, np.inf), LARGEST_W)
+        of_vehicles, of_psi = np.square(self.settings.vehicle_noise)
+        covariance = np.diag(self._process_variance)
+        for s in range(len(rho)):
+            i, j = 2 * s, 2 * s + 1
+            covariance[i, i] += self.settings.density_growth**2 * rho[s]
+            direction = np.array([1.0, w[s]])
+            covariance[i : j + 1, i : j + 1] += (
+                of_vehicles * rho[s] * np.outer(direction, direction)
+            )
+            covariance[j, j] += of_psi * rho[s]
+        return covariance
 
     def z(self, seen: Measurement) -> FloatArray:
         """Return the observed numbers `(2 m,)`."""
@@ -249,7 +259,7 @@ class _ExtendedFilter(EpisodeFilter, ExtendedKalmanFilter):  # type: ignore[misc
 
     def predict_x(self, u: FloatArray) -> None:
         """Predict by f instead of a matrix."""
-        self.F, self.Q = self.problem.F(self.x, u), np.diag(self.problem.Q(self.x))
+        self.F, self.Q = self.problem.F(self.x, u), self.problem.Q(self.x)
         self.x = self.problem.project(self.problem.f(self.x[None], u))[0]
 
     def advance(self, u: FloatArray) -> None:
@@ -299,9 +309,9 @@ class _UnscentedFilter(EpisodeFilter, UnscentedKalmanFilter):  # type: ignore[mi
         self.has_points = False
 
     def advance(self, u: FloatArray) -> None:
-        variance = self.problem.Q(self.x)
+        covariance = self.problem.Q(self.x)
         self._draw(u)
-        self.P += np.diag(variance)
+        self.P += covariance
 
     def _draw(self, u: FloatArray | None) -> None:
         """Draw points, move them by f where there are inputs, and take their moments."""
@@ -361,15 +371,15 @@ class _Ensemble(EpisodeFilter):
 
     def restart(self) -> None:
         members = np.repeat(self.prior[None], self.enkf.n_members, axis=0)
-        self.members = self._perturbed(members, self.problem.prior_variance)
+        self.members = self._perturbed(members, np.diag(self.problem.prior_variance))
 
-    def _perturbed(self, members: FloatArray, variance: FloatArray) -> FloatArray:
+    def _perturbed(self, members: FloatArray, covariance: FloatArray) -> FloatArray:
         drawn = draw(self.process, members.size).reshape(members.shape[::-1]).T
-        return self.problem.project(members + np.sqrt(variance) * drawn)
+        return self.problem.project(members + drawn @ np.linalg.cholesky(covariance).T)
 
     def advance(self, u: FloatArray) -> None:
-        variance = self.problem.Q(self.x)
-        self.members = self._perturbed(self.problem.f(self.members, u), variance)
+        covariance = self.problem.Q(self.x)
+        self.members = self._perturbed(self.problem.f(self.members, u), covariance)
 
     def assimilate(self, seen: Measurement) -> FloatArray:
         if not seen.observed.any():
@@ -431,7 +441,7 @@ class _Stage:
     e: FloatArray = field(init=False)  # (2 m,)
     # Set when the stage is left.
     u: FloatArray = field(init=False)  # (n_u,)
-    Q: FloatArray = field(init=False)  # (n_x,)
+    Q: FloatArray = field(init=False)  # (n_x, n_x)
     A: FloatArray = field(init=False)  # (n_x, n_x)
     c: FloatArray = field(init=False)  # (n_x,)
 
@@ -510,13 +520,14 @@ class _Window(EpisodeFilter):
                 H[here, here] += weighted @ stage.C
                 q[here] -= 2.0 * weighted @ (self.problem.z(stage.seen) - stage.e)
             if i < L - 1:
-                weighted = stage.A.T / stage.Q
+                inverse = np.linalg.inv(stage.Q)
+                weighted = stage.A.T @ inverse
                 H[here, here] += weighted @ stage.A
-                H[after, after] += np.diag(1.0 / stage.Q)
+                H[after, after] += inverse
                 H[here, after] -= weighted
                 H[after, here] -= weighted.T
                 q[here] += 2.0 * weighted @ stage.c
-                q[after] -= 2.0 * stage.c / stage.Q
+                q[after] -= 2.0 * inverse @ stage.c
         return H, q
 
     def _innovations(self) -> FloatArray:

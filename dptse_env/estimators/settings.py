@@ -199,6 +199,9 @@ class EstimatorSettings(_Checked, path=PATH):
             psi over rho_m v_f.
         density_growth: Standard deviation, over rho_m, of a further process noise of rho at jam
             density; its variance is in proportion to rho.
+        vehicle_noise: Standard deviations, over rho_m and rho_m v_f, of a further process noise at
+            jam density, whose variances are in proportion to rho: of vehicles that the model does
+            not foresee, whose w is that of the others, and of psi beside that.
         count_noise: Variance of a measured density beside the mechanism's noise, as a share of
             rho / l, the variance of a Poisson count: the model's densities are no counts.
         demand: Settings of demand states; None for a filter that takes the demands as given.
@@ -225,6 +228,7 @@ class EstimatorSettings(_Checked, path=PATH):
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
     density_growth: Deviation = 0.0
+    vehicle_noise: tuple[Deviation, Deviation] = (0.0, 0.0)
     count_noise: Annotated[float, Interval(0, 100)] = 0.0
     demand: DemandSettings | None = None
     walk_noise: tuple[Deviation, Deviation] = (0.025, 0.025)

@@ -25,6 +25,7 @@ from dptse_env.estimators.ekf import (
     restart,
 )
 from dptse_env.estimators.linalg import (
+    add_noise,
     downdate,
     factor,
     forward,
@@ -71,18 +72,19 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     road, arz, _, filters, points = bundle.parts
     n, width = points.states.shape[1:]
     scratch, noise, shift = make_batch_scratch(road, width), np.empty(n), np.empty(n)
+    slopes = np.empty(road.n_segments)
     root, distances = np.empty(filters.covariances.shape[1:]), np.empty((n, width))
     for k in range(episodes.size):
         e = episodes[k]
         mean, covariance, states = filters.means[e], filters.covariances[e], points.states[e]
-        process_noise(road, filters, mean, noise)
+        process_noise(road, filters, mean, noise, slopes)
         if not _draw(filters, points, e, root):
             fill_vector(mean, np.nan)  # detected by the update, which resets the filter
         advance_states(road, arz, states, inputs[k], scratch)
         project_states(road, arz, states, filters.is_box)
         _gather(filters, points, e, distances, shift)
+        add_noise(noise, slopes, covariance)
         for i in range(n):
-            covariance[i, i] += noise[i]
             mean[i] = states[i, 0] + shift[i] * filters.units[i]
         project(road, arz, mean, filters.is_box)
         points.moved[e] = True

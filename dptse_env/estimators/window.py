@@ -26,6 +26,7 @@ from dptse_env.estimators.linalg import (
     add_product,
     apply,
     apply_transposed,
+    divide_by_noise,
     mirror,
     pair_update,
     propagate,
@@ -62,7 +63,8 @@ class Window(NamedTuple):
     blocks: FloatArray  # (L, S, K, 4) of the transitions A that leave each stage
     by_factor: FloatArray  # (L, E, 2) derivatives of the entries' segments by demand factors
     offsets: FloatArray  # (L, n_x)
-    process_variance: FloatArray  # (L, n_x)
+    process_variance: FloatArray  # (L, n_x) of Q; see `add_noise`
+    slopes: FloatArray  # (L, S) of Q
     observed: BoolArray  # (L, M)
     weights: FloatArray  # (L, M, 2, 2 x largest span) of both numbers of each row
     targets: FloatArray  # (L, M, 2) values less the constants of the linearisation
@@ -167,8 +169,9 @@ def factorise(
                 P[i, i] = window.arrival_variance[i]
         else:
             blocks, by_factor = window.blocks[t - 1], window.by_factor[t - 1]
-            noise, previous = window.process_variance[t - 1], factor.covariances[t - 1]
-            propagate(road, blocks, by_factor, noise, previous, factor.scratch, P)
+            noise, slopes = window.process_variance[t - 1], window.slopes[t - 1]
+            previous = factor.covariances[t - 1]
+            propagate(road, blocks, by_factor, noise, slopes, previous, factor.scratch, P)
             mirror(P)
         if t == n_stages - 1:
             copy_matrix(P, factor.before)
@@ -426,7 +429,10 @@ def evaluate(road: Road, channels: Channels, window: Window, iterate: Iterate) -
         # d_t = A z_{t-1} + b - z_t adds Q^-1 d_t to stage t and -A' Q^-1 d_t to stage t - 1
         for i in range(n):
             defects[t, i] = weighted[i] + window.offsets[t - 1, i] - z[t, i]
-            descent[t, i] = weighted[i] = defects[t, i] / window.process_variance[t - 1, i]
+            weighted[i] = defects[t, i]
+        divide_by_noise(window.process_variance[t - 1], window.slopes[t - 1], weighted)
+        for i in range(n):
+            descent[t, i] = weighted[i]
         apply_transposed(road, blocks, by_factor, n_factors, weighted, adjoint)
         for i in range(n):
             descent[t - 1, i] -= adjoint[i]
@@ -453,6 +459,8 @@ def write_diagonal(road: Road, channels: Channels, window: Window, diagonal: Flo
         variance = window.arrival_variance if t == 0 else window.process_variance[t - 1]
         for i in range(variance.size):
             diagonal[t, i] = 1.0 / variance[i]
+        for s in range(road.n_segments if t > 0 else 0):
+            diagonal[t, 2 * s] += window.slopes[t - 1, s] ** 2 / variance[2 * s + 1]
         for m in range(channels.first.size):
             if not window.observed[t, m]:
                 continue
@@ -463,13 +471,16 @@ def write_diagonal(road: Road, channels: Channels, window: Window, diagonal: Flo
     for t in range(n_stages - 1):
         out, K = diagonal[t], window.process_variance[t]
         for c in range(road.n_segments):
+            slope = window.slopes[t, c]
             for slot in range(road.degree[c]):
                 b, block = road.neighbours[c, slot], window.blocks[t, c, slot]
-                out[2 * b] += block[0] ** 2 / K[2 * c] + block[2] ** 2 / K[2 * c + 1]
-                out[2 * b + 1] += block[1] ** 2 / K[2 * c] + block[3] ** 2 / K[2 * c + 1]
+                by_rho, by_psi = block[2] - slope * block[0], block[3] - slope * block[1]
+                out[2 * b] += block[0] ** 2 / K[2 * c] + by_rho**2 / K[2 * c + 1]
+                out[2 * b + 1] += block[1] ** 2 / K[2 * c] + by_psi**2 / K[2 * c + 1]
         for e in range(K.size - n):
             c, by_factor = road.entries[e], window.by_factor[t, e]
-            out[n + e] += by_factor[0] ** 2 / K[2 * c] + by_factor[1] ** 2 / K[2 * c + 1]
+            beside = by_factor[1] - window.slopes[t, c] * by_factor[0]
+            out[n + e] += by_factor[0] ** 2 / K[2 * c] + beside**2 / K[2 * c + 1]
             out[n + e] += 1.0 / K[n + e]
 
 

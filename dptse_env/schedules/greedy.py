@@ -208,10 +208,12 @@ def choose(
         if design.is_walk:
             _drift(design, covariance, work.to_speed)
         else:
-            no_factors = np.empty((0, 2))
+            no_factors, no_slopes = np.empty((0, 2)), np.empty(0)
             normalise(arz, design.units[0], work.blocks, no_factors)
             noise = design.process_variance
-            propagate(road, work.blocks, no_factors, noise, covariance, work.square, covariance)
+            propagate(
+                road, work.blocks, no_factors, noise, no_slopes, covariance, work.square, covariance
+            )
             mirror(covariance)
         for segment in design.always:
             _update(design, covariance, segment, work)

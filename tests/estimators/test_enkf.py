@@ -18,7 +18,10 @@ from tests.model.oracle import W99
 from .helpers import RELEASES, RICH, run, simulate, started, step, update
 
 OPTIONS = {
-    "rich": {name: getattr(RICH, name) for name in ("demand", "density_growth", "count_noise")},
+    "rich": {
+        name: getattr(RICH, name)
+        for name in ("demand", "density_growth", "vehicle_noise", "count_noise")
+    },
     "taper": {"enkf": EnsembleSettings(inflation=1.02, taper=0.35, n_members=31)},
     "inflation": {"enkf": EnsembleSettings(inflation=1.1)},
     "plain": {},

@@ -54,6 +54,7 @@ def random_program(n_stages=4, spread=1.0):
         by_factor=rng.normal(0.0, 0.5, (n_stages, n_factors, 2)),
         offsets=rng.normal(0.2, 0.1, (n_stages, N)),
         process_variance=rng.uniform(0.01, 0.1, (n_stages, N)),
+        slopes=np.zeros((n_stages, s)),
         observed=rng.random((n_stages, N_CHANNELS)) < 0.3,
         weights=rng.normal(0.0, 1.0, (n_stages, N_CHANNELS, 2, 6)),
         targets=rng.normal(0.5, spread, (n_stages, N_CHANNELS, 2)),
@@ -61,6 +62,8 @@ def random_program(n_stages=4, spread=1.0):
         lower=np.zeros(N),
         upper=np.ones(N),
     )
+    # Drawn last, so that all else is as without.
+    window.slopes[:] = rng.normal(0.0, 0.5, window.slopes.shape)
     return Program(window, *dense(window))
 
 
@@ -90,7 +93,11 @@ def dense(window):
     add([0], np.eye(N), window.arrival, window.arrival_variance)
     for t in range(n_stages - 1):
         B = np.hstack([-transition(window, t), np.eye(N)])
-        add([t, t + 1], B, window.offsets[t], window.process_variance[t])
+        whitening = np.eye(N)  # the inverse of L in Q = L D L'
+        psi = np.arange(1, 2 * ROAD.n_segments, 2)
+        whitening[psi, psi - 1] = -window.slopes[t]
+        offsets = whitening @ window.offsets[t]
+        add([t, t + 1], whitening @ B, offsets, window.process_variance[t])
     for t in range(n_stages):
         for m in np.flatnonzero(window.observed[t]):
             at, B = 2 * MODEL.channels.first[m], np.zeros((2, N))
