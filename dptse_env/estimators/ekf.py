@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.estimators.base import Estimate, KernelEstimator, Measurement
+from dptse_env.estimators.flicker import Flicker
 from dptse_env.estimators.linalg import is_covariance, mirror, padded, pair_update, propagate
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -84,6 +85,7 @@ class CovarianceFilter(KernelEstimator):
             is_box=settings.bounds == "box",
         )
         self.arrays = self._moments = Bundle(*model.dynamics, self.filters)
+        self._flicker = Flicker(model, n_episodes) if settings.flicker else None
         for episode in range(n_episodes):
             restart(self.filters, episode)
 
@@ -100,7 +102,8 @@ class CovarianceFilter(KernelEstimator):
 
     @property
     def _memory(self) -> tuple[AnyArray, ...]:
-        return self.filters.means, self.filters.covariances, self.filters.priors
+        since = () if self._flicker is None else (self._flicker.since,)
+        return self.filters.means, self.filters.covariances, self.filters.priors, *since
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
@@ -112,6 +115,13 @@ class CovarianceFilter(KernelEstimator):
     ) -> None:
         self.filters.priors[episodes] = self.model.project(states, self.settings.bounds)
         self._restart(episodes)
+        if self._flicker is not None:
+            self._flicker.reset(episodes)
+
+    def _update(self, episodes: IntArray, measured: Measurement) -> None:
+        if self._flicker is not None:
+            measured = self._flicker.added(episodes, measured, self.filters.means[episodes])
+        super()._update(episodes, measured)
 
     def _restart(self, episodes: IntArray) -> None:
         """Reset episodes to their priors."""

@@ -36,7 +36,7 @@ REFERENCE_SPEED = 51.0
 SPEEDS, FLOWS = np.array([15.0, 6.0]), np.array([15.0, 15.0 * REFERENCE_SPEED])
 PLAIN = EstimatorSettings()
 RICH = EstimatorSettings(
-    density_growth=0.03, vehicle_noise=(0.04, 0.02), count_noise=0.5,
+    density_growth=0.03, vehicle_noise=(0.04, 0.02), count_noise=0.5, flicker=True,
     demand=DemandSettings(),
 )  # fmt: skip
 
