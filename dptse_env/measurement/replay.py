@@ -7,8 +7,7 @@ observed. When the readings come, it goes back and takes them in each of these s
 
 from __future__ import annotations
 
-from operator import getitem
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from dptse_env.estimators import Estimator, Measurement
 from dptse_env.measurement.loops import LoopReadings
 from dptse_env.release import Task
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import Bundle, kernel
 from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.threads import EpisodeThreads
 
@@ -48,13 +48,18 @@ class Replay:
             raise ValueError(f"estimator must return its own arrays as _memory, got {name}")
         self._kept = [np.empty_like(array) for array in own]
         self._first = np.zeros(estimator.n_episodes, dtype=np.int64)
-        shape, self._n_cells = (loops.interval, estimator.n_episodes), task.n_cells
-        most = task.queries.most_queries + len(task.always)
+        shape, most = (loops.interval, estimator.n_episodes), task.queries.most_queries
+        numbers = (*shape, most + len(task.always), 2)
         # np.zeros takes address space, not memory, until seconds are kept.
-        self._inputs = np.zeros((*shape, estimator.model.n_inputs))
-        self._observed = np.zeros((*shape, task.n_channels), dtype=np.bool_)
-        self._numbers = np.zeros((2, *shape, most, 2))  # values and sigma of observed channels
-        self._centre = np.zeros((*shape, task.n_cells)) if task.releases_flow else None
+        log = Log(
+            inputs=np.zeros((*shape, estimator.model.n_inputs)),
+            observed=np.zeros((*shape, task.n_channels), dtype=np.bool_),
+            values=np.zeros(numbers),
+            sigma=np.zeros(numbers),
+            centre=np.zeros((*shape, task.n_cells if task.releases_flow else 0)),
+            n_cells=task.n_cells,
+        )
+        self._log = Bundle(log)
 
     @property
     def shared(self) -> tuple[Any, ...]:
@@ -87,38 +92,37 @@ class Replay:
             inputs: The model's inputs of its prediction, shape (k, n_u).
             measured: The measurement that it was updated by.
         """
-        second = (times - 1) % self._loops.interval
-        self._inputs[second, episodes] = inputs
-        self._observed[second, episodes] = measured.observed
-        row, channel, slot = _slots(measured.observed)
-        numbers = measured.values[row, channel], measured.sigma[row, channel]
-        self._numbers[:, second[row], episodes[row], slot] = numbers
-        if self._centre is not None:
-            self._centre[second, episodes] = measured.centre
+        keep(self._log, (times - 1) % self._loops.interval, episodes, inputs, measured)
         ends = times % self._loops.interval == 0
         if ends.any():
-            self._again(episodes[ends], traffic[ends], times[ends] // self._loops.interval - 1)
+            self._threads.run(self._again, episodes[ends], (traffic[ends], times[ends]), _block_of)
 
-    def _again(self, episodes: IntArray, traffic: IntArray, intervals: IntArray) -> None:
-        """Live through intervals of episodes again, with their readings, and begin the next."""
+    def _again(self, episodes: IntArray, place: tuple[IntArray, IntArray]) -> None:
+        """Live through the interval that ends of episodes (k,) again, with its readings.
+
+        Args:
+            episodes: Shape (k,).
+            place: Index of their traffic seeds and second of the record, shape (k,) each.
+        """
         order = np.argsort(self._first[episodes], kind="stable")
-        episodes, traffic, intervals = episodes[order], traffic[order], intervals[order]
+        episodes, (traffic, times) = episodes[order], (each[order] for each in place)
         first, estimator, k = self._first[episodes], self.estimator, len(episodes)
         innovations = estimator.innovations[episodes]
         diverged, fallback = estimator.diverged[episodes], estimator.fallback[episodes]
         for kept, array in zip(self._kept, estimator.memory, strict=True):
             array[episodes] = kept[episodes]
-        said, size = self._loops.said(self._loops.read(traffic, intervals)), max(BLOCK // k, 1)
-        for begin in range(first[0], self._loops.interval, size):
-            seconds = np.arange(begin, min(begin + size, self._loops.interval))
-            each = np.tile(np.arange(k), len(seconds))
-            given = self._loops.added(self._measured(seconds, episodes), said.at(each))
-            inputs = self._inputs[seconds[:, None], episodes]
+        said = self._loops.said(self._loops.last(traffic, times))
+        interval, size = self._loops.interval, max(BLOCK // k, 1)
+        for begin in range(first[0], interval, size):
+            seconds = np.arange(begin, min(begin + size, interval))
+            inputs, observed, values, sigma, centre = recall(self._log, seconds, episodes)
+            measured = Measurement(observed, values, sigma, centre)
+            given = self._loops.added(measured, said.at(np.tile(np.arange(k), len(seconds))))
             # Episodes that began within the interval join in later.
             for i, n in enumerate(np.searchsorted(first, seconds, "right").tolist()):
-                live, own = episodes[:n], given.at(slice(i * k, i * k + n))
-                self._threads.run(estimator.predict, live, inputs[i, :n], getitem)
-                self._threads.run(estimator.update, live, own, Measurement.at)
+                live = episodes[:n]
+                estimator.predict(live, inputs[i, :n])
+                estimator.update(live, given.at(slice(i * k, i * k + n)))
                 diverged[:n] |= estimator.diverged[live]
                 fallback[:n] |= estimator.fallback[live]
         estimator.innovations[episodes] = innovations
@@ -126,23 +130,74 @@ class Replay:
         self._first[episodes] = 0
         self._keep(episodes)
 
-    def _measured(self, seconds: IntArray, episodes: IntArray) -> Measurement:
-        """Return what was measured in each of some seconds, one after the other, of episodes."""
-        place, n_rows = (seconds[:, None], episodes), len(seconds) * len(episodes)
-        observed = self._observed[place].reshape(n_rows, -1)
-        row, channel, slot = _slots(observed)
-        values, sigma = np.zeros((2, *observed.shape, 2))
-        second, episode = np.divmod(row, len(episodes))
-        at = seconds[second], episodes[episode], slot
-        values[row, channel], sigma[row, channel] = self._numbers[(slice(None), *at)]
-        if self._centre is None:  # a mean speed has none
-            centre = np.full((n_rows, self._n_cells), np.nan)
-        else:
-            centre = self._centre[place].reshape(n_rows, -1)
-        return Measurement(observed, values, sigma, centre)
+
+def _block_of(place: tuple[IntArray, IntArray], block: slice) -> tuple[IntArray, IntArray]:
+    traffic, times = place
+    return traffic[block], times[block]
 
 
-def _slots(observed: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Return row, channel and number in its row of each observed channel of (k, C)."""
-    row, channel = np.nonzero(observed)
-    return row, channel, np.arange(row.size) - np.searchsorted(row, row)
+class Log(NamedTuple):
+    """What was given in the T seconds of the present interval of n episodes.
+
+    Slots have the channels that were observed, one after the other.
+    """
+
+    inputs: FloatArray  # (T, n, n_u)
+    observed: BoolArray  # (T, n, C)
+    values: FloatArray  # (T, n, slots, 2)
+    sigma: FloatArray  # (T, n, slots, 2)
+    centre: FloatArray  # (T, n, cells), without cells where mean speeds are released
+    n_cells: int  # of a measurement
+
+
+@kernel
+def keep(
+    bundle: Any, seconds: IntArray, episodes: IntArray, inputs: FloatArray, measured: Measurement
+) -> None:
+    """Write down what was given in seconds of the interval (k,) of episodes (k,)."""
+    (log,) = bundle.parts
+    for k in range(episodes.size):
+        t, e, slot = seconds[k], episodes[k], 0
+        for i in range(log.inputs.shape[2]):
+            log.inputs[t, e, i] = inputs[k, i]
+        for i in range(log.centre.shape[2]):
+            log.centre[t, e, i] = measured.centre[k, i]
+        for c in range(log.observed.shape[2]):
+            log.observed[t, e, c] = measured.observed[k, c]
+            if measured.observed[k, c]:
+                if slot == log.values.shape[2]:
+                    raise ValueError("more channels were observed than the bandwidth pays for")
+                for j in range(2):
+                    log.values[t, e, slot, j] = measured.values[k, c, j]
+                    log.sigma[t, e, slot, j] = measured.sigma[k, c, j]
+                slot += 1
+
+
+@kernel
+def recall(
+    bundle: Any, seconds: IntArray, episodes: IntArray
+) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray, FloatArray]:
+    """Return inputs (m, k, n_u) of m seconds of k episodes, and the fields of a `Measurement`.
+
+    These have m k rows, second by second; what was not observed is 0.
+    """
+    (log,) = bundle.parts
+    m, n, C = seconds.size, episodes.size, log.observed.shape[2]
+    inputs, centre = np.empty((m, n, log.inputs.shape[2])), np.full((m * n, log.n_cells), np.nan)
+    observed = np.zeros((m * n, C), dtype=np.bool_)
+    values, sigma = np.zeros((m * n, C, 2)), np.zeros((m * n, C, 2))
+    for i in range(m):
+        for k in range(n):
+            t, e, row, slot = seconds[i], episodes[k], i * n + k, 0
+            for j in range(inputs.shape[2]):
+                inputs[i, k, j] = log.inputs[t, e, j]
+            for j in range(log.centre.shape[2]):
+                centre[row, j] = log.centre[t, e, j]
+            for c in range(C):
+                observed[row, c] = log.observed[t, e, c]
+                if observed[row, c]:
+                    for j in range(2):
+                        values[row, c, j] = log.values[t, e, slot, j]
+                        sigma[row, c, j] = log.sigma[t, e, slot, j]
+                    slot += 1
+    return inputs, observed, values, sigma, centre

@@ -263,9 +263,8 @@ def test_a_copy_that_is_stepped_like_its_origin_gives_the_same_bits(copied, esti
 # --- what is kept ---------------------------------------------------------------------------------
 
 
-def bytes_of(part):
-    found = [part] if isinstance(part, np.ndarray) else part
-    return sum(array.nbytes for array in found)
+def bytes_of(parts):
+    return sum(part.nbytes for part in parts if isinstance(part, np.ndarray))
 
 
 @pytest.mark.parametrize("preset", ["paper-highway", "private-highway", "long-highway"])
@@ -274,8 +273,9 @@ def test_one_state_is_kept_for_an_interval_and_little_more(preset):
     loops = {"positions": [0.0, 0.5, 1.0], "interval": 20}
     config = resolve(preset, {"traffic_seeds": [0], "loops": loops, "estimator": "ekf"})
     process = QueryProcess(config, 4)
-    own = [part for part in vars(process.replay).values() if isinstance(part, np.ndarray | list)]
-    assert sum(map(bytes_of, own)) < 2 * bytes_of(process.estimator.memory)
+    (log,) = process.replay._log.parts
+    kept = bytes_of(process.replay._kept) + bytes_of(log)
+    assert kept < 2 * bytes_of(process.estimator.memory)
 
 
 # --- estimators of other packages, and those that cannot go back ----------------------------------
