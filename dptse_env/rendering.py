@@ -22,6 +22,7 @@ TRUTH_COLOUR = "#000000"
 ESTIMATE_COLOUR = "#0072b2"
 QUERY_COLOUR = "#d55e00"
 NO_QUERY_COLOUR = "#f2f4f7"
+LOOP_COLOUR = "#009e73"
 LIMIT_STEP = 10.0
 """Step in which the axis of errors grows [veh/km]."""
 SMOOTH_FROM = 500
@@ -42,6 +43,7 @@ class History:
         queried: Segments that a query covered, flags (n_mainline,) per second.
         rmse: Density error over the mainline [veh/km], a number per second.
         title: Road, estimator and bandwidth in words.
+        loops: Places of stations of loops along the mainline [km].
     """
 
     episode: int
@@ -53,6 +55,7 @@ class History:
     queried: list[BoolArray] = field(default_factory=list)
     rmse: list[float] = field(default_factory=list)
     title: str = ""
+    loops: tuple[float, ...] = ()
 
     @classmethod
     def empty(cls, process: QueryProcess, episode: int = 0) -> History:
@@ -66,8 +69,10 @@ class History:
         title = (
             f"{corridor.name}, estimator {estimator}, queries {config.bandwidth} {unit} a second"
         )
-        scale = corridor.scales.density_scale
-        return cls(episode, config.horizon_steps, lengths, scale, title=title)
+        scale, loops = corridor.scales.density_scale, ()
+        if process.loops is not None:
+            loops = tuple(process.loops.stations.positions.tolist())
+        return cls(episode, config.horizon_steps, lengths, scale, title=title, loops=loops)
 
     @property
     def road_length(self) -> float:
@@ -163,11 +168,23 @@ class Picture:
         )
         self._true = axis.stairs(zeros, color=TRUTH_COLOUR, label="true density", **look)
         self._estimated = axis.stairs(zeros, color=ESTIMATE_COLOUR, label="estimate", **look)
+        if history.loops:
+            mark = {"marker": "^", "markersize": 6, "linestyle": "", "color": LOOP_COLOUR}
+            axis.plot(
+                history.loops,
+                np.zeros(len(history.loops)),
+                label="loops",
+                **mark,
+                clip_on=False,
+                zorder=3,
+            )
         axis.set(xlim=(0.0, edges[-1]), ylim=(0.0, top))
         axis.set_xlabel("position along the road [km]", fontsize=8)
         axis.set_ylabel("[veh/km]", fontsize=8)
         place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderaxespad": 0.0}
-        axis.legend(ncols=3, frameon=False, fontsize=8, **place)
+        if history.loops:  # one entry more beside the title
+            place |= {"columnspacing": 1.0, "handlelength": 1.2}
+        axis.legend(ncols=4, frameon=False, fontsize=8, **place)
 
     def draw(self, history: History) -> NDArray[np.uint8]:
         """Return the picture of ``history`` as RGB, shape (height, width, 3)."""

@@ -210,9 +210,14 @@ def load_policy(
 def describe_road(corridor: Corridor) -> str:
     """Return the name and the sizes of a corridor in words."""
     length = min(corridor.geometry.segment_lengths[: corridor.geometry.n_mainline])
+    loops, beside = corridor.loops, ""
+    if loops is not None:
+        places = [*map("{:g}".format, loops.positions), *(f"ramp {face}" for face in loops.ramps)]
+        beside = f", loops at {', '.join(places)} every {loops.interval} s"
     return (
         f"{corridor.name} ({corridor.geometry.n_mainline} mainline segments of {length:g} km, "
-        f"{corridor.geometry.most_lanes} lanes, fixed sensors on {list(corridor.fixed_sensors)})"
+        f"{corridor.geometry.most_lanes} lanes, fixed sensors on {list(corridor.fixed_sensors)}"
+        f"{beside})"
     )
 
 

@@ -164,6 +164,16 @@ def test_it_is_loaded_for_any_form_of_the_environment(stored):
         load_policy(stored, gym.make("CartPole-v1"))
 
 
+def test_a_road_policy_acts_beside_loops_by_the_estimate_alone(stored):
+    loops = make_env(loops={"positions": [0.0, 0.3]})
+    with_loops = load_policy(stored, loops, allow=["corridor"])
+    without = load_policy(stored, make_env())
+    seen = loops.reset(seed=0)[0]
+    plain = seen[: make_env().observation_space.shape[0]]
+    assert len(plain) == len(seen) - 7
+    np.testing.assert_array_equal(with_loops.predict(seen)[0], without.predict(plain)[0])
+
+
 def test_the_card_describes_the_policy(stored):
     policy, config = untrained()
     file = read_policy(stored)
@@ -198,6 +208,10 @@ def test_the_card_describes_the_policy(stored):
             r"channels is \['mainline released_speed'\] for .*\['mainline released_flow'\]",
         ),
         ({"corridor": {"fixed_sensors": [7]}}, r"sensors on \[5, 7\]\), .* sensors on \[7\]\)"),
+        (
+            {"loops": {"positions": [0.2], "ramps": [4]}},
+            r"sensors on \[5, 7\]\), .* sensors on \[5, 7\], loops at 0.2, ramp 4 every 20 s\)",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore:privacy.preset")
