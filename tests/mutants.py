@@ -749,6 +749,14 @@ MUTANTS = (
         "test_non_interference.py",
     ),
     Mutant(
+        "an observation has the reading of an interval that has not ended", 25,
+        "measurement/loops.py",
+        "some = np.full((len(times), len(self.stations.beside), 2), np.nan), interval >= 0",
+        "some = np.full((len(times), len(self.stations.beside), 2), np.nan), interval > -2; "
+        "interval = np.minimum(interval + 1, 5)",
+        "test_non_interference.py",
+    ),
+    Mutant(
         "a reading holds true densities", 25, "measurement/loops.py",
         "self._traffic.readings[traffic, interval]",
         "self._traffic.readings[traffic, interval] "

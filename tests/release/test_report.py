@@ -81,7 +81,7 @@ PROTECTED = [
 ]
 
 
-@pytest.mark.parametrize(("privacy", "keywords", "protects"), PROTECTED)
+@pytest.mark.parametrize(("privacy", "keywords", "protects"), PROTECTED, ids=range(len(PROTECTED)))
 def test_without_loops_a_report_protects_presence_and_names_no_loops(privacy, keywords, protects):
     found = privacy_report(resolve("private-highway", {"privacy": privacy, **keywords})).to_dict()
     assert found["protects"] == protects
@@ -97,7 +97,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize(("privacy", "keywords", "protects"), PROTECTED)
+@pytest.mark.parametrize(("privacy", "keywords", "protects"), PROTECTED, ids=range(len(PROTECTED)))
 @pytest.mark.parametrize("least_count", [0, 2])
 def test_beside_loops_a_report_protects_reports_given_the_readings(
     privacy, keywords, protects, least_count
