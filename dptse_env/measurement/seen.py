@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from dptse_env.measurement.loops import LEAST_SPEED, NOTHING_PASSED, UNKNOWN, deviations
+from dptse_env.measurement.loops import NOTHING_PASSED, UNKNOWN, interpreted
 from dptse_env.utils.units import HOUR
 from dptse_env.utils.validation import (
     Interval,
@@ -23,6 +23,8 @@ from dptse_env.utils.validation import (
 
 LONGEST = 600
 """Seconds of an interval at most."""
+TYPICAL_LENGTH = 0.1
+"""Length of segments beside a station, for its deviations [km]."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +78,14 @@ def station(
     speed: float | None = None,
     seconds: int,
     lanes: int,
+    limit: float = 100.0,
     until: int | None = None,
     ramp: int | None = None,
 ) -> Seen:
     """Return what a station of loops says, which counts all vehicles of all lanes.
 
-    Its density is flow / speed. Where nobody passed, the road is empty or stands, which a loop
-    cannot tell.
+    Its density is flow / speed, and more in a jam, by fits to simulated traffic. Where nobody
+    passed, the road is empty or stands, which a loop cannot tell.
 
     Args:
         km: Its place; see `Seen`.
@@ -91,6 +94,7 @@ def station(
         speed: Arithmetic mean of their speeds [km/h]; None where nobody passed.
         seconds: Length of the interval [s].
         lanes: Lanes that it counts.
+        limit: Speed limit there [km/h]. Speeds far below it are those of a jam.
         until: Last second of the interval; None for the present one.
         ramp: See `Seen`.
 
@@ -100,6 +104,7 @@ def station(
     """
     seconds = integer("station.seconds", seconds, 1, LONGEST)
     lanes = integer("station.lanes", lanes, 1, 16)
+    limit = inside("station.limit", limit, 1.0, 1e3)
     allowed = "given where flow is not, and only there"
     require((count is None) != (flow is None), "station.count", allowed, count)
     if count is None:
@@ -111,9 +116,10 @@ def station(
         return Seen(km, km, 0.0, None, density_std, None, seconds, until, ramp)
     require(speed is not None, "station.speed", f"a number where {name} is above 0", speed)
     mean = non_negative("station.speed", speed)
-    density_std, speed_std = map(float, deviations(np.array(mean)))
-    density = passing / max(mean, LEAST_SPEED)
-    return Seen(km, km, density, mean, lanes * density_std, speed_std, seconds, until, ramp)
+    flows, speeds, is_ramp = np.array(passing), np.array(mean), ramp is not None
+    said = interpreted(flows, speeds, seconds, lanes, TYPICAL_LENGTH, limit, is_ramp)
+    density, speed, density_std, speed_std, _ = map(float, said)
+    return Seen(km, km, density, speed, density_std, speed_std, seconds, until, ramp)
 
 
 def probes(

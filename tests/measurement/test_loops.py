@@ -1,9 +1,16 @@
 """Loop detectors: readings, what they say of segments, and their place in the process."""
 
+import itertools
+import warnings
+
 import numpy as np
+import pytest
 
 from dptse_env.config import resolve
+from dptse_env.measurement.loops import NOTHING_PASSED, interpreted
 from dptse_env.process import QueryProcess
+from dptse_env.traffic import CORRIDORS, Loops, RecordLibrary, Stations, readings
+from dptse_env.traffic.loops import borders_of
 
 SEEDS = range(2000, 2004)
 
@@ -41,3 +48,132 @@ def test_processes_that_share_loaded_traffic_read_the_same():
         for process in (first, second):
             process.step(np.arange(1), np.ones((1, 6), dtype=np.int8))
         np.testing.assert_array_equal(first.estimate.density, second.estimate.density)
+
+
+def told(count, speed, interval=20, lanes=3.0, length=0.1, limit=102.0, **keywords):
+    """What a station says that counted some vehicles of a mean speed."""
+    flow = np.asarray(count, dtype=float) * 3600.0 / interval
+    speeds = np.broadcast_to(np.asarray(speed, dtype=float), flow.shape)
+    return interpreted(flow, speeds, interval, lanes, length, limit, **keywords)
+
+
+def test_free_traffic_has_flow_over_speed_and_a_jam_has_more():
+    said = told([15, 10, 30], [102.0, 15.0, 15.0])
+    plain = np.array([2700 / 102, 1800 / 15, 5400 / 15])
+    assert said.density[0] == pytest.approx(plain[0], rel=0.03)
+    assert said.density[1] > 1.3 * plain[1]
+    assert said.density[2] == pytest.approx(plain[2])  # as dense as vehicles at this speed are
+    assert said.speed[0] == pytest.approx(102.0, rel=0.02)
+    assert said.speed[1] < 0.95 * 15.0
+
+
+def test_deviations_grow_in_jams_with_length_and_on_ramps():
+    free, jam, ramp = told(15, 102.0), told(10, 15.0), told(10, 15.0, is_ramp=True)
+    assert free.density_std < 0.4 * jam.density_std < 0.4 * ramp.density_std
+    assert free.speed_std < jam.speed_std < ramp.speed_std
+    far = told(10, 15.0, length=1.0)
+    assert far.density_std > 1.1 * jam.density_std
+    assert far.speed_std > 1.1 * jam.speed_std
+    # Few vehicles on a short segment flicker most.
+    assert told(15, 102.0, length=0.05).density_std > 1.2 * free.density_std
+
+
+@pytest.mark.parametrize("interval", [1, 20, 60, 600])
+def test_seconds_of_an_interval_are_alike_and_most_in_a_jam(interval):
+    free, jam = told(0.75 * interval, 102.0, interval), told(0.5 * interval, 15.0, interval)
+    nothing = told(0, np.nan, interval)
+    assert 1.0 <= free.density_alike <= jam.density_alike <= nothing.density_alike == interval
+
+
+def test_who_sees_nobody_knows_little_and_who_is_silent_says_nothing():
+    said = told([0, np.nan], np.nan)
+    assert said.density.tolist() == pytest.approx([0.0, np.nan], nan_ok=True)
+    assert said.density_std.tolist() == pytest.approx([3 * NOTHING_PASSED, np.nan], nan_ok=True)
+    assert np.isnan(said.speed).all()
+    assert np.isnan(said.speed_std).all()
+
+
+def misfits(corridor, seeds, interval, library):
+    """Class of speed, and mean squared error over variance of density and speed, by reading.
+
+    Classes are those of the speed over the limit: below .25, .5, .75, above; 4 where nobody passed.
+    """
+    geometry, road = corridor.geometry, corridor.road
+    ramps = sorted([*geometry.on_ramps, *geometry.off_ramps])
+    loops = Loops(tuple(borders_of(geometry).tolist()), tuple(ramps), interval)
+    stations, found = Stations.of(loops, geometry), []
+    for seed, beside in itertools.product(seeds, stations.beside.T):
+        record = library.get(corridor, seed)
+        read = readings(record, stations, loops)
+        truth = record.traffic(road.lengths, road.limits)[1 : len(read) * interval + 1, beside]
+        truth = truth.reshape(len(read), interval, len(beside), 2)
+        count, speed, limit = read[..., 0], read[..., 1], road.limits[beside]
+        is_ramp = beside >= geometry.n_mainline
+        said = told(count, speed, interval, road.lanes[beside], road.lengths[beside], limit,
+                    is_ramp=is_ramp)  # fmt: skip
+        square = ((truth[..., 0] - said.density[:, None]) / said.density_std[:, None]) ** 2
+        slip = ((truth[..., 1] - said.speed[:, None]) / said.speed_std[:, None]) ** 2
+        slip[truth[..., 0] == 0.0] = np.nan
+        classes = np.where(count > 0, np.digitize(speed / limit, (0.25, 0.5, 0.75)), 4)
+        with warnings.catch_warnings(action="ignore"):  # means of nothing
+            means = np.nanmean(square, axis=1), np.nanmean(slip, axis=1)
+        found.append(np.stack([classes, *means], axis=-1).reshape(-1, 3))
+    return np.concatenate(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("interval", "least", "most"), [(20, 0.55, 1.7), (60, 0.55, 1.7), (300, 0.4, 2.1)]
+)
+def test_deviations_are_those_of_readings_of_test_traffic(interval, least, most):
+    """By class of speed, against the truth of each second, on all built-in roads."""
+    library, found = RecordLibrary(), []
+    for corridor in (*CORRIDORS.values(), resolve("private-highway", {}).corridor):
+        n_seeds = 1 if corridor.name == "long-highway" else 4
+        if interval < corridor.conditions.duration:
+            found.append(misfits(corridor, range(2000, 2000 + n_seeds), interval, library))
+    table = np.concatenate(found)
+    for speeds in range(4):
+        density, speed = np.nanmean(table[table[:, 0] == speeds, 1:], axis=0)
+        assert least < density < most, (speeds, density, speed)
+        assert least < speed < most, (speeds, density, speed)
+    nobody = table[table[:, 0] == 4, 1]
+    assert nobody.size == 0 or nobody.mean() < most
+
+
+def errors(seeds, **keywords):
+    """Mean errors of densities by episode, five segments queried round robin [veh/km]."""
+    n = len(seeds)
+    given = {"traffic_seeds": list(seeds), "corridor": {"fixed_sensors": []}, **keywords}
+    process, every = QueryProcess(resolve("private-highway", given), n), np.arange(n)
+    streams = [np.random.default_rng([7, seed]) for seed in seeds]
+    process.reset(every, streams, {"traffic_seed": list(seeds), "start": 0})
+    found = []
+    for second in range(process.config.horizon_steps):
+        queries = np.zeros((n, 15), dtype=np.int8)
+        queries[:, (second + 3 * np.arange(5)) % 15] = 1
+        process.step(every, queries)
+        found.append(process.error.density.copy())
+    return np.mean(found[60:], axis=0)
+
+
+WORSE = {("asm", 1.0), ("ekf", 0.2), ("blend", 0.2)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("penetration", [1.0, 0.2])
+@pytest.mark.parametrize("estimator", ["recurrent", "ekf", "ukf", "enkf", "mhe", "blend", "asm"])
+def test_loops_make_no_estimate_worse(estimator, penetration):
+    """The upper end of the interval of the error's growth is below 2 %, paired over 32 seeds."""
+    given = {"estimator": estimator, "bandwidth": 5}
+    if penetration < 1.0:
+        given |= {"penetration": penetration}
+    if penetration < 1.0 and estimator == "recurrent":
+        given["fusion"] = {"dwell_factor": 1}
+    seeds = range(1000, 1032)
+    without = errors(seeds, **given)
+    for interval in (20, 60, 300):
+        loops = {"positions": [0.0, 0.5, 1.0, 1.5], "interval": interval}
+        growth = errors(seeds, **given, loops=loops) / without.mean() - without / without.mean()
+        half = 2.04 * growth.std(ddof=1) / len(growth) ** 0.5
+        print(estimator, penetration, interval, f"{growth.mean():.3f} +- {half:.3f}")
