@@ -49,6 +49,7 @@ GUIDES = {
     },
     "audit.md": {"--trials 500": "--trials 100 --workers 1", "--one-run": "--one-run --workers 1"},
     "guarantee.md": {},
+    "your-own-stream.md": {'("recurrent", "asm", "ekf")': '("asm",)'},
 }
 """Guides with commands, and passages of each with what runs in their place."""
 
@@ -144,6 +145,15 @@ def test_a_network_becomes_a_fitted_road(run_guide):
     road = read_corridor("town/road.toml")
     assert (road.geometry.n_mainline, road.geometry.off_ramps) == (15, (11,))
     assert Path("town/road-fit/fit.md").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
+def test_a_stream_is_followed_and_compared_with_straight_lines(run_guide):
+    need("polars")
+    printed, names = run_guide("your-own-stream.md")
+    assert names["again"].time == 1800
+    assert re.search(r"^asm: \d+\.\d km/h, (no )?better than straight lines, ", printed, re.M)
 
 
 @pytest.mark.slow
