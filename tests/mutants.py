@@ -744,8 +744,8 @@ MUTANTS = (
     ),
     Mutant(
         "a reading comes before its interval", 25, "measurement/replay.py",
-        "times[ends] // self._loops.interval - 1)",
-        "np.minimum(times[ends] // self._loops.interval, 4))",
+        "self._loops.last(traffic, times)",
+        "self._loops.last(traffic, np.minimum(times + self._loops.interval, 42))",
         "test_non_interference.py",
     ),
     Mutant(
