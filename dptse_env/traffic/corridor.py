@@ -210,6 +210,9 @@ class Corridor:
         require(unique, "corridor.fixed_sensors", "free of duplicates", self.fixed_sensors)
         if self.loops is not None:
             object.__setattr__(self, "loops", self.loops.at_borders(self.geometry))
+            duration, interval = self.conditions.duration, self.loops.interval
+            allowed = f"<= {duration} s, the length of a record"
+            require(interval <= duration, "corridor.loops.interval", allowed, interval)
         self._check_conditions()
         self._check_origin()
 

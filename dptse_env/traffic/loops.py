@@ -50,8 +50,9 @@ class Loops:
             values = getattr(self, name)
             increasing = list(values) == sorted(set(values))
             require(increasing, f"corridor.loops.{name}", "increasing", values)
-        any_station = bool(self.positions or self.ramps)
-        require(any_station, "corridor.loops", "stations at positions or on ramps", "none")
+        allowed = "not empty where no ramp has a station"
+        some = bool(self.positions or self.ramps)
+        require(some, "corridor.loops.positions", allowed, self.positions)
 
     def at_borders(self, geometry: Geometry) -> Self:
         """Return these stations at borders of a road's segments.
@@ -73,6 +74,8 @@ class Loops:
             allowed = f"faces with a ramp, {known}"
             require(face in known, "corridor.loops.ramps", allowed, face)
         nearest = [borders[each] for each in self.faces(geometry).tolist()]
+        apart, allowed = len(set(nearest)) == len(nearest), "nearest to borders of their own"
+        require(apart, "corridor.loops.positions", allowed, self.positions)
         moved = [
             f"{given:g} to {border:g} km"
             for given, border in zip(self.positions, nearest, strict=True)

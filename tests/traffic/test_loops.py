@@ -1,0 +1,78 @@
+"""Settings of loop detectors: borders, warnings, refusals and road files."""
+
+import json
+import math
+
+import pytest
+
+from dptse_env.config import resolve
+from dptse_env.traffic import SHORT_HIGHWAY, Loops, read_corridor, write_corridor
+
+PLACES = {"positions": [0.0, 0.3, 0.6]}
+
+
+def test_a_position_within_a_segment_is_moved_to_the_nearest_border_and_this_is_said():
+    said = r"corridor\.loops\.positions lie within segments; moved 0\.16 to 0\.2 km"
+    with pytest.warns(UserWarning, match=said):
+        road = SHORT_HIGHWAY.replaced(loops={"positions": [0.0, 0.16, 0.3004]})
+    assert road.loops == Loops((0.0, 0.2, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("loops", "message"),
+    [
+        ({"positions": [0.61]}, r"positions must be in 0\.\.0\.6 km, got 0\.61"),
+        ({"positions": [-0.1]}, r"positions\[0\] must be a number in \[0, 10000\], got -0\.1"),
+        ({"positions": [math.nan]}, r"positions\[0\] must be a number in .*, got nan"),
+        ({"positions": ["a"]}, r"positions\[0\] must be a number in .*, got 'a'"),
+        ({"positions": 0.3}, r"positions must be a sequence, got 0\.3"),
+        ({"positions": [0.3, 0.1]}, r"positions must be increasing, got \(0\.3, 0\.1\)"),
+        ({"positions": [0.3, 0.3]}, r"positions must be increasing, got \(0\.3, 0\.3\)"),
+        ({"positions": [0.29, 0.31]}, r"positions must be nearest to borders of their own, got .*"),
+        ({}, r"positions must be not empty where no ramp has a station, got \(\)"),
+        (PLACES | {"interval": 0}, r"interval must be an integer in 1\.\.600, got 0"),
+        (PLACES | {"interval": 601}, r"interval must be an integer in 1\.\.600, got 601"),
+        (PLACES | {"interval": 20.5}, r"interval must be an integer in 1\.\.600, got 20\.5"),
+        (PLACES | {"interval": 300}, r"interval must be <= 240 s, the length of a record, got 300"),
+        (PLACES | {"least_count": -1}, r"least_count must be an integer in 0\.\.1000, got -1"),
+        (PLACES | {"ramps": [3]}, r"ramps must be faces with a ramp, \(2, 4\), got 3"),
+        (PLACES | {"ramps": [4, 2]}, r"ramps must be increasing, got \(4, 2\)"),
+        (PLACES | {"lanes": 3}, r"lanes is unknown; allowed: positions, ramps, interval, .*"),
+    ],
+)
+def test_what_is_no_station_is_refused_with_path_and_value(loops, message):
+    with pytest.raises(ValueError, match=rf"^corridor\.loops\.{message}$"):
+        resolve("short-highway", {"loops": loops})
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"loops": []}, r"corridor\.loops must be a mapping or Loops or None, got \[\]"),
+        ({"query_spans": [2]}, r"query_spans must be numbers with 1 among them on a road with .*"),
+        ({"backend": "reference"}, r"backend must be 'compiled' on a road with loops, .*"),
+    ],
+)
+def test_what_does_not_suit_loops_is_refused(keywords, message):
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        resolve("short-highway", {"loops": PLACES, **keywords})
+
+
+def test_a_road_file_keeps_loops_and_names_itself_where_they_are_wrong(tmp_path):
+    path = tmp_path / "road.toml"
+    loops = PLACES | {"ramps": [2], "interval": 30, "least_count": 2}
+    road = SHORT_HIGHWAY.replaced(name="own", loops=loops)
+    write_corridor(path, road)
+    assert read_corridor(path) == road
+    given = {"corridor": str(path), "loops": {"interval": 60}}
+    assert resolve("short-highway", given).corridor.loops.interval == 60
+    assert resolve("short-highway", {"corridor": str(path), "loops": None}).corridor.loops is None
+    path.write_text(path.read_text().replace("interval = 30", "interval = 700"))
+    with pytest.raises(ValueError, match=r"road\.toml: corridor\.loops\.interval must be .* 700"):
+        read_corridor(path)
+
+
+def test_keywords_of_loops_survive_json():
+    config = resolve("short-highway", {"loops": PLACES | {"ramps": [2]}})
+    loops = json.loads(json.dumps(config.corridor.fields()))["loops"]
+    assert resolve("short-highway", {"loops": loops}).corridor == config.corridor
