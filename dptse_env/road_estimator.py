@@ -91,8 +91,9 @@ class RoadEstimator:
         Args:
             road: A road file, the name of a road, or a `Corridor`.
             estimator: See the keyword of an environment.
-            stations: Places of stations on the mainline [km], increasing. Without settings, `asm`
-                smooths over half of their mean distance, .1 km at least.
+            stations: Places of stations on the mainline [km], increasing. Where neither caller nor
+                road file give settings, `asm` smooths over half of their mean distance, over 0.1 to
+                1 km.
             start: The present second, on the clock of the stream.
             parameters: See the keyword of an environment.
             estimator_settings: See the keyword of an environment.
@@ -111,7 +112,7 @@ class RoadEstimator:
         self._borders = dict(_borders(self.corridor.geometry))
         settings = config.settings()
         distance = self._distance(stations)
-        if distance > 0.0 and "estimator_settings" not in given and hasattr(settings, "asm"):
+        if distance > 0.0 and config.estimator_settings is None and hasattr(settings, "asm"):
             own = dataclasses.replace(settings.asm, length=min(max(0.5 * distance, 0.1), 1.0))
             settings = dataclasses.replace(settings, asm=own)
         self._estimator = make_estimator(estimator, "compiled", self.model, 1, settings)

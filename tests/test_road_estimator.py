@@ -136,6 +136,19 @@ def test_a_source_says_something_of_the_segments_at_its_place():
         assert changed.tolist() == segments, (ends, ramp)
 
 
+def test_adaptive_smoothing_reaches_over_half_the_distance_of_stations():
+    blind, near = make("asm"), {"asm": {"length": 0.1}}
+    blind.step()
+    for keywords, reached in (
+        ({}, 4),
+        ({"stations": (0.0, 0.6)}, 6),
+        ({"stations": (0.0, 0.6), "estimator_settings": near}, 4),
+    ):
+        road = make("asm", **keywords)
+        road.step([Seen(0.0, 0.0, speed=20.0, speed_std=1.0)])
+        assert np.count_nonzero(bits(road)[1, :6] < bits(blind)[1, :6] - 0.5) == reached
+
+
 def test_a_point_within_a_segment_is_said_to_count_at_its_border():
     with pytest.warns(UserWarning, match=r"^0\.26 km lies .* counts at its border at 0\.3 km$"):
         make().step(loops(0, borders=[0.26]), seconds=60)
