@@ -206,8 +206,8 @@ class QueryProcess:
         streams = [list(map(np.random.default_rng, _seed_of(each).spawn(4))) for each in generators]
         for_traffic, for_noise, for_estimator, for_detectors = zip(*streams, strict=True)
         traffic, starts = draw_traffic(fixed, self.config, for_traffic)
-        for index in self.traffic.load(traffic):
-            self.boundary.load(index)
+        self.traffic.load(traffic)
+        self.boundary.load(traffic)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
         self.start[episodes] = starts
         self.pending.reset(episodes)

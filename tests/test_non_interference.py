@@ -4,8 +4,9 @@ No error would show it if it did, and the proofs would be void. With a release m
 the same values whatever the traffic, two episodes over different traffic must look the same, bit by
 bit: observations, estimates and ``info``, and prices, centres and deviations, which depend on what
 was released before alone. The paper's presets feed the estimator true boundary inputs. That is
-their declared exception, so they are tested without it, and one test shows that it is one. Ways for
-the truth to slip through are mutants, in ``tests/mutants.py``.
+their declared exception, so they are tested without it, and one test shows that it is one. Loops
+are read exactly and in public; beside them two traffics with the same readings must look the same.
+Ways for the truth to slip through are mutants, in ``tests/mutants.py``.
 """
 
 import itertools
@@ -191,9 +192,9 @@ def test_what_is_released_of_traffics_does_differ():
 
 LOOPS = {"positions": [0.3], "interval": 7}
 BESIDE_LOOPS = [
-    ("paced", "ekf", "greedy-trace"), ("paced", "recurrent", "expected-reduction"),
-    ("capped", "mhe", "round-robin"), ("paced", "enkf", "stale-variance"),
-    ("printed", "ukf", "speed-front"),
+    ("paced", "ekf", "mask", "greedy-trace"), ("paced", "recurrent", "mask", "expected-reduction"),
+    ("capped", "mhe", "sequential", None), ("paced", "enkf", "mask", "stale-variance"),
+    ("printed", "ukf", "mask", "speed-front"),
 ]  # fmt: skip
 
 
@@ -215,15 +216,19 @@ def make_beside_loops(preset, trips=None, **keywords):
 
 
 @pytest.mark.parametrize(
-    ("preset", "estimator", "schedule"),
+    ("preset", "estimator", "action", "schedule"),
     fast_and_slow(
-        [*BESIDE_LOOPS, *itertools.product(("capped", "paced"), ESTIMATORS, ("round-robin",))],
+        [
+            *BESIDE_LOOPS,
+            *itertools.product(("capped", "paced"), ESTIMATORS, ACTION_ENCODINGS, [None]),
+        ],
         BESIDE_LOOPS,
     ),
 )
-def test_traffic_with_equal_readings_does_not_show(preset, estimator, schedule):
+def test_traffic_with_equal_readings_does_not_show(preset, estimator, action, schedule):
     """Vehicles pass the loop in other seconds of an interval, and others are connected."""
-    env = make_beside_loops(preset, estimator=estimator, **(PARTLY if preset == "paced" else {}))
+    options = PARTLY if preset == "paced" else {}
+    env = make_beside_loops(preset, estimator=estimator, action=action, **options)
     assert not unlike(env, schedule)
     readings = env.unwrapped.process.traffic.readings
     np.testing.assert_array_equal(*readings)

@@ -39,8 +39,8 @@ class BoundaryModel(ABC):
     def inputs(self, episodes: IntArray, traffic: IntArray, times: IntArray) -> FloatArray:
         """Return inputs (k, n_u) of episodes (k,), by index of the traffic seed and second (k,)."""
 
-    def load(self, index: int) -> None:  # noqa: B027 (nothing by default)
-        """Prepare for the traffic of an index, which the traffic table has loaded."""
+    def load(self, indices: IntArray) -> None:  # noqa: B027 (nothing by default)
+        """Prepare for the traffic of some indices, which the traffic table has loaded."""
 
     def reset(self, episodes: IntArray) -> None:  # noqa: B027 (nothing by default)
         """Begin new episodes, shape (k,)."""
@@ -61,16 +61,19 @@ class TrueBoundary(BoundaryModel):
         self._table = np.empty(
             (len(traffic.seeds), task.corridor.conditions.duration + 1, model.n_inputs)
         )
+        self._loaded = np.zeros(len(traffic.seeds), dtype=bool)
 
     @property
     def shared(self) -> tuple[FloatArray, ...]:
         """The inputs of all traffic."""
         return (self._table,)
 
-    def load(self, index: int) -> None:
-        """Compute the inputs of a complete record."""
-        traffic = self.traffic.complete(index)[:, self.model.n_segments :]
-        self._table[index] = self.model.boundary_inputs(traffic[..., 0], traffic[..., 1])
+    def load(self, indices: IntArray) -> None:
+        """Compute the inputs of complete records, of each once."""
+        for index in np.unique(indices[~self._loaded[indices]]).tolist():
+            traffic = self.traffic.complete(index)[:, self.model.n_segments :]
+            self._table[index] = self.model.boundary_inputs(traffic[..., 0], traffic[..., 1])
+            self._loaded[index] = True
 
     def inputs(self, episodes: IntArray, traffic: IntArray, times: IntArray) -> FloatArray:
         """Return the true inputs."""

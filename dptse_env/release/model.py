@@ -27,9 +27,9 @@ from dptse_env.utils.vector_info import Infos
 class ReleaseModel(ABC):
     """Base class of release models, for a batch of episodes.
 
-    Estimators, observations and policies learn of the traffic through `release` and the boundary
-    inputs (`dptse_env.measurement.boundary`) alone. A subclass reads true traffic from
-    ``traffic``. Its constructor must be cheap: nothing is loaded then.
+    Estimators, observations and policies learn of the traffic through `release`, the boundary
+    inputs (`dptse_env.measurement.boundary`) and the readings of loops alone. A subclass reads true
+    traffic from ``traffic``. Its constructor must be cheap: nothing is loaded then.
 
     A model with a guarantee overrides `report` and `spent`; otherwise no guarantee is reported.
 

@@ -35,8 +35,8 @@ def make(kind, preset="capped", n_episodes=1):
     config = resolve("short-highway", keywords)
     release, model = make_release(config, n_episodes), make_model(config)
     boundary = BOUNDARIES[kind](release.task, release.traffic, model)
-    for index in release.traffic.load([0, 1]):
-        boundary.load(index)
+    release.traffic.load([0, 1])
+    boundary.load(np.array([0, 1]))
     return boundary, model
 
 

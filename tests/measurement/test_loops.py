@@ -35,8 +35,8 @@ def test_readings_tell_the_estimator_of_the_traffic():
 
 
 def test_processes_that_share_loaded_traffic_read_the_same():
-    loops, privacy = {"positions": [0.3], "interval": 20}, {"boundary_inputs": "nominal"}
-    given = {"traffic_seeds": [0], "horizon": 60, "loops": loops, "privacy": privacy}
+    """Loops, and the boundary of this id, which is that of the true traffic."""
+    given = {"traffic_seeds": [0], "horizon": 60, "loops": {"positions": [0.3], "interval": 20}}
     first = QueryProcess(resolve("short-highway", given))
     second = QueryProcess(first.config, traffic=first.traffic)
     assert first.traffic.load([0]) == [0]
