@@ -179,6 +179,17 @@ def test_an_oracle_answers_when_an_episode_is_over():
     assert (action.sum(axis=1) == 2).all()
 
 
+@pytest.mark.parametrize("name", ["speed-front", "expected-reduction", "greedy-trace"])
+def test_a_reading_of_a_loop_counts_as_no_query(name):
+    """Rules choose as on a road without loops until one reports, and leave no segment to loops."""
+    beside_all = {"positions": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6], "interval": 5}
+    given = {"corridor": {"fixed_sensors": []}, "horizon": 40}
+    with_loops, _ = play(make_single(loops=beside_all, **given), name, 40)
+    without, _ = play(make_single(**given), name, 40)
+    np.testing.assert_array_equal(with_loops[:5], without[:5])
+    assert (with_loops.sum(axis=0) > 0).all()
+
+
 def test_only_oracles_use_the_truth():
     env = make_batch()
     blind = [*sorted(set(OBSERVATION_SCHEDULES) - {"all"}), *PROCESS_SCHEDULES]
