@@ -43,7 +43,7 @@ def streaming(road: Corridor, estimator: str, interval: int, seconds: int) -> Ca
     with quietly():
         followed = RoadEstimator(road, estimator)
     borders = range(0, road.geometry.n_mainline + 1, 5)
-    said = [station(0.1 * face, flow=4500, speed=90, seconds=interval, lanes=3) for face in borders]
+    said = [station(0.1 * face, flow=4500, speed=90, seconds=interval) for face in borders]
 
     def turn() -> None:
         for second in range(1, seconds + 1):

@@ -9,6 +9,7 @@ their variances. What nobody saw is as predicted.
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from dptse_env.estimators import Estimate, Measurement, make_estimator
 from dptse_env.geometry import Geometry
 from dptse_env.measurement import nominal_state
 from dptse_env.measurement.boundary import nominal_inputs
-from dptse_env.measurement.loops import UNKNOWN
+from dptse_env.measurement.loops import UNKNOWN, interpreted
 from dptse_env.measurement.seen import LONGEST, Seen
 from dptse_env.parts import make_model
 from dptse_env.traffic.loops import TOLERANCE
@@ -40,9 +41,6 @@ SPACING = 8
 back costs an eighth of the way at most."""
 N_ROWS = 768
 """Seconds of the stream that are kept. States that are gone back to are 727 s old at most."""
-ALIKE = 3
-"""Seconds of an interval that count as one: the same vehicles are beside a point for so long. For
-filters on the traffic model, which trust their prediction too much, an interval counts once."""
 LATEST = 2**40
 """Largest second of a clock, and minus the smallest one."""
 
@@ -60,7 +58,7 @@ class Entry(NamedTuple):
     before: int  # the second before its interval, or before what can still change
     until: int
     cells: IntArray  # segments, and boundary segments beside them if it knows both quantities
-    added: FloatArray  # (2, 2) weights 1 / std^2 and weighted values, of density and speed
+    added: FloatArray  # (cells, 2, 2) weights 1 / std^2 and weighted values of both quantities
 
 
 class RoadEstimator:
@@ -116,7 +114,6 @@ class RoadEstimator:
             own = dataclasses.replace(settings.asm, length=min(max(0.5 * distance, 0.1), 1.0))
             settings = dataclasses.replace(settings, asm=own)
         self._estimator = make_estimator(estimator, "compiled", self.model, 1, settings)
-        self._alike = LONGEST if self._estimator.steps_model else ALIKE
         self.time = self._start = integer("start", start, -LATEST, LATEST)
         self._made_of = {
             "road": json_digest([repr(self.corridor.geometry), self.corridor.digest]),
@@ -219,15 +216,38 @@ class RoadEstimator:
         until, oldest = now if each.until is None else each.until, max(now - LONGEST, self._start)
         allowed = f"in {oldest + 1}..{now}, which can still change"
         require(oldest < until <= now, f"{path}.until", allowed, until)
-        pairs = ((each.density, each.density_std), (each.speed, each.speed_std))
-        weights = [0.0 if std is None else 1.0 / std**2 for _, std in pairs]
-        added = [(w, w * (value or 0.0)) for w, (value, _) in zip(weights, pairs, strict=True)]
-        before = max(until - each.seconds, oldest)
-        cells, road = self._segments(path, each), self.corridor.road
-        if 0.0 not in weights:
-            at_ends = np.flatnonzero(np.isin(road.beside, cells))
-            cells = np.concatenate([cells, road.n_segments + at_ends])
-        return Entry(before, until, cells, np.array(added) / min(each.seconds, self._alike))
+        before, cells = max(until - each.seconds, oldest), self._segments(path, each)
+        added = self._weighted(each, cells)
+        at_ends = np.isin(self.corridor.road.beside, cells[added[:, :, 0].all(axis=1)])
+        beside = np.searchsorted(cells, self.corridor.road.beside[at_ends])
+        ends = self.model.n_segments + np.flatnonzero(at_ends)
+        return Entry(
+            before, until, np.concatenate([cells, ends]), np.concatenate([added, added[beside]])
+        )
+
+    def _weighted(self, each: Seen, segments: IntArray) -> FloatArray:
+        """Return weights and weighted values of a source on segments, (k, 2, 2)."""
+        road, seconds = self.corridor.road, each.seconds
+        # An interval counts once: errors of its seconds are alike. Of what a flow says they are not
+        # alike as far as numbers on a segment vary, which filters on the traffic model take for
+        # waves.
+        alike = np.full((2, 1), float(seconds))
+        if each.flow is None:
+            pairs = [(each.density, each.density_std), (each.speed, each.speed_std)]
+            told = [[math.nan if x is None else x for x in pair] for pair in pairs]
+            values, stds = np.array(told).T[..., None]
+        else:
+            speed = math.nan if each.speed is None else each.speed
+            said = interpreted(
+                np.array(each.flow), np.array(speed), seconds, road.lanes[segments],
+                road.lengths[segments], road.limits[segments], segments >= road.n_mainline,
+            )  # fmt: skip
+            values, stds = np.stack(said[:2]), np.stack(said[2:4])
+            if not self._estimator.steps_model:
+                alike = np.stack([said.density_alike, np.full(len(segments), float(seconds))])
+        weights = np.nan_to_num(1.0 / (alike * stds**2))
+        added = np.stack([weights, weights * np.nan_to_num(values)], axis=-1)
+        return np.broadcast_to(added.swapaxes(0, 1), (len(segments), 2, 2))
 
     def _segments(self, path: str, each: Seen) -> IntArray:
         """Return the segments that a source says something of."""

@@ -77,7 +77,7 @@ def test_a_day_of_stations_is_followed(first, hours):
         while row is not None and row[0] <= minute:
             _, time, km, count, speed = row
             until = int(dt.datetime.fromisoformat(time).timestamp())
-            seen.append(station(km, count=count, speed=speed, seconds=60, lanes=3, until=until))
+            seen.append(station(km, count=count, speed=speed, seconds=60, until=until))
             row = next(rows)
         road.step(seen, seconds=60)
         if minute % 31 == 0:

@@ -8,9 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-import numpy as np
-
-from dptse_env.measurement.loops import NOTHING_PASSED, UNKNOWN, interpreted
+from dptse_env.measurement.loops import UNKNOWN
 from dptse_env.utils.units import HOUR
 from dptse_env.utils.validation import (
     Interval,
@@ -23,8 +21,6 @@ from dptse_env.utils.validation import (
 
 LONGEST = 600
 """Seconds of an interval at most."""
-TYPICAL_LENGTH = 0.1
-"""Length of segments beside a station, for its deviations [km]."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +39,11 @@ class Seen:
         seconds: Seconds that it is an average of.
         until: The last of them; None for the present one.
         ramp: Face at which its ramp meets the mainline; None for the mainline.
+        flow: Flow of all lanes at a point [veh/h], from which, with the speed, density and
+            deviations follow (`dptse_env.measurement.loops.interpreted`); None elsewhere.
 
     Raises:
-        ValueError: A value is out of range, or lacks its deviation.
+        ValueError: A value is out of range or lacks its deviation, or a flow its speed.
     """
 
     start: Annotated[float, Interval(0, 1e4)]
@@ -57,17 +55,29 @@ class Seen:
     seconds: Annotated[int, Interval(1, LONGEST)] = 1
     until: int | None = None
     ramp: int | None = None
+    flow: Annotated[float, Interval(0, 1e5)] | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
         checked_fields(self, "seen")
         require(self.start <= self.end, "seen.end", f">= start, {self.start:g} km", self.end)
+        if self.flow is not None:
+            self._check_flow(self.flow)
+            return
         for name in ("density", "speed"):
             value, std = getattr(self, name), getattr(self, f"{name}_std")
             allowed = f"a number where {name} is one, and None elsewhere"
             require((value is None) == (std is None), f"seen.{name}_std", allowed, std)
         known = self.density is not None or self.speed is not None
         require(known, "seen.speed", "a number where there is no density", None)
+
+    def _check_flow(self, flow: float) -> None:
+        require(self.start == self.end, "seen.end", f"start, {self.start:g} km", self.end)
+        for name in ("density", "density_std", "speed_std"):
+            value = getattr(self, name)
+            require(value is None, f"seen.{name}", "None where there is a flow", value)
+        known = flow == 0.0 or self.speed is not None
+        require(known, "seen.speed", "a number where vehicles passed", self.speed)
 
 
 def station(
@@ -77,24 +87,17 @@ def station(
     flow: float | None = None,
     speed: float | None = None,
     seconds: int,
-    lanes: int,
-    limit: float = 100.0,
     until: int | None = None,
     ramp: int | None = None,
 ) -> Seen:
     """Return what a station of loops says, which counts all vehicles of all lanes.
 
-    Its density is flow / speed, and more in a jam, by fits to simulated traffic. Where nobody
-    passed, the road is empty or stands, which a loop cannot tell.
-
     Args:
         km: Its place; see `Seen`.
         count: Vehicles that passed in its interval; None where `flow` is given.
         flow: The same as a flow [veh/h]; None where `count` is given.
-        speed: Arithmetic mean of their speeds [km/h]; None where nobody passed.
+        speed: Arithmetic mean of their speeds [km/h]; None or NaN where nobody passed.
         seconds: Length of the interval [s].
-        lanes: Lanes that it counts.
-        limit: Speed limit there [km/h]. Speeds far below it are those of a jam.
         until: Last second of the interval; None for the present one.
         ramp: See `Seen`.
 
@@ -103,8 +106,6 @@ def station(
             is a count without a speed.
     """
     seconds = integer("station.seconds", seconds, 1, LONGEST)
-    lanes = integer("station.lanes", lanes, 1, 16)
-    limit = inside("station.limit", limit, 1.0, 1e3)
     allowed = "given where flow is not, and only there"
     require((count is None) != (flow is None), "station.count", allowed, count)
     if count is None:
@@ -112,14 +113,10 @@ def station(
     else:
         name, passing = "count", non_negative("station.count", count) * HOUR / seconds
     if passing == 0.0:
-        density_std = lanes * NOTHING_PASSED
-        return Seen(km, km, 0.0, None, density_std, None, seconds, until, ramp)
+        return Seen(km, km, seconds=seconds, until=until, ramp=ramp, flow=0.0)
     require(speed is not None, "station.speed", f"a number where {name} is above 0", speed)
     mean = non_negative("station.speed", speed)
-    flows, speeds, is_ramp = np.array(passing), np.array(mean), ramp is not None
-    said = interpreted(flows, speeds, seconds, lanes, TYPICAL_LENGTH, limit, is_ramp)
-    density, speed, density_std, speed_std, _ = map(float, said)
-    return Seen(km, km, density, speed, density_std, speed_std, seconds, until, ramp)
+    return Seen(km, km, speed=mean, seconds=seconds, until=until, ramp=ramp, flow=passing)
 
 
 def probes(

@@ -5,39 +5,18 @@ import math
 import pytest
 
 from dptse_env import Seen, probes, station
-from dptse_env.measurement.loops import NOTHING_PASSED
 
 NAN = float("nan")
-READING = {"km": 1.2, "seconds": 60, "lanes": 3}
+READING = {"km": 1.2, "seconds": 60}
 
 
-def test_a_station_says_flow_over_speed_of_all_lanes():
+def test_a_station_says_flow_and_speed_at_a_point():
     said = station(**READING, count=50, speed=75.0, until=120, ramp=4)
     assert said == station(**READING, flow=3000.0, speed=75.0, until=120, ramp=4)
     assert (said.start, said.end, said.seconds, said.until, said.ramp) == (1.2, 1.2, 60, 120, 4)
-    assert said.density == pytest.approx(40.0, abs=12.0)
-    assert said.speed == pytest.approx(75.0, abs=5.0)
-    free = station(**READING, count=50, speed=100.0)
-    assert (free.density, free.speed) == pytest.approx((30.0, 100.0), rel=0.05)
-
-
-def test_a_station_tells_a_jam_by_the_speed_limit():
-    slow, fast = (station(**READING, count=30, speed=60.0, limit=limit) for limit in (60.0, 130.0))
-    assert slow.density == pytest.approx(30.0, rel=0.05)
-    assert fast.density > 1.5 * slow.density
-    assert fast.density_std > 2.0 * slow.density_std
-    assert fast.speed < slow.speed
-
-
-def test_a_station_knows_least_of_a_jam_and_of_an_interval_in_which_nobody_passed():
-    free, jam, nothing = (
-        station(**READING, count=count, speed=speed)
-        for count, speed in ((50, 100.0), (50, 20.0), (0, None))
-    )
-    assert free.density_std < jam.density_std < nothing.density_std == 3 * NOTHING_PASSED
-    assert (nothing.density, nothing.speed, nothing.speed_std) == (0.0, None, None)
-    wider = station(**READING | {"lanes": 4}, count=50, speed=20.0)
-    assert wider.density_std == pytest.approx(4 / 3 * jam.density_std, rel=0.05)
+    assert (said.flow, said.speed, said.density, said.speed_std) == (3000.0, 75.0, None, None)
+    nothing = station(**READING, count=0, speed=NAN)
+    assert (nothing.flow, nothing.speed) == (0.0, None)
 
 
 def test_the_deviation_of_probes_falls_with_their_number():
@@ -60,12 +39,11 @@ READINGS = [
     ({"count": 0, "seconds": 0}, r"station\.seconds must be an integer in 1\.\.600, got 0"),
     ({"count": 0, "seconds": 601}, r"station\.seconds must be an integer .*, got 601"),
     ({"count": 0, "seconds": 20.5}, r"station\.seconds must be an integer .*, got 20\.5"),
-    ({"count": 0, "lanes": 0}, r"station\.lanes must be an integer in 1\.\.16, got 0"),
     ({"count": 0, "km": -0.1}, r"seen\.start must be a number in \[0, 10000\], got -0\.1"),
     ({"count": 0, "km": NAN}, r"seen\.start must be a number in \[0, 10000\], got nan"),
     ({"count": 0, "until": 1.5}, r"seen\.until must be an integer or None, got 1\.5"),
     ({"count": 0, "ramp": "on"}, r"seen\.ramp must be an integer or None, got 'on'"),
-    ({"count": 1e9, "speed": 1}, r"seen\.density must be a number in \[0, 10000\]"),
+    ({"count": 1e9, "speed": 1}, r"seen\.flow must be a number in \[0, 100000\] or None"),
 ]
 
 
@@ -95,6 +73,9 @@ VALUES = [
     ({"speed": 80}, r"seen\.speed_std must be a number where speed is one, .* got None"),
     ({"speed": 80, "speed_std": 0}, r"seen\.speed_std must be a number in \[0\.001, 1"),
     ({"density": 20, "density_std": -1}, r"seen\.density_std must be a number in \[0\.001, 1"),
+    ({"flow": 900, "density": 9, "density_std": 9}, r"seen\.end must be start, 0 km, got 0\.1"),
+    ({"end": 0.0, "flow": 9, "speed": 9, "speed_std": 9}, r"seen\.speed_std must be None where"),
+    ({"end": 0.0, "flow": 900}, r"seen\.speed must be a number where vehicles passed, got None"),
     ({"speed_std": 5}, r"seen\.speed_std must be a number where speed is one, .* got 5"),
 ]
 
@@ -102,4 +83,4 @@ VALUES = [
 def test_values_and_deviations_come_together():
     for values, message in VALUES:
         with pytest.raises(ValueError, match=f"^{message}"):
-            Seen(0.0, 0.1, **values)
+            Seen(**{"start": 0.0, "end": 0.1} | values)
