@@ -208,6 +208,8 @@ class QueryProcess:
         traffic, starts = draw_traffic(fixed, self.config, for_traffic)
         self.traffic.load(traffic)
         self.boundary.load(traffic)
+        if self.loops is not None:
+            self.loops.load(traffic)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
         self.start[episodes] = starts
         self.pending.reset(episodes)

@@ -744,8 +744,8 @@ MUTANTS = (
     ),
     Mutant(
         "a reading comes before its interval", 25, "measurement/replay.py",
-        "self._loops.last(traffic, times)",
-        "self._loops.last(traffic, np.minimum(times + self._loops.interval, 42))",
+        "self._loops.said_until(traffic, times)",
+        "self._loops.said_until(traffic, np.minimum(times + self._loops.interval, 42))",
         "test_non_interference.py",
     ),
     Mutant(

@@ -4,7 +4,8 @@ Readings are public before the releases and no part of any budget. A reading com
 interval and says something of every second of it: `dptse_env.measurement.replay`.
 """
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from dptse_env.estimators import Measurement
 from dptse_env.release import Task, Traffic
 from dptse_env.traffic import Stations
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
+from dptse_env.utils.kernels import Bundle, kernel
 from dptse_env.utils.units import HOUR, KMH
 
 LEAST_SPEED = 3.0
@@ -51,10 +53,6 @@ class Said(NamedTuple):
     density_std: FloatArray  # of one second
     speed_std: FloatArray
     density_alike: FloatArray  # seconds that are alike, from 1 to all
-
-    def at(self, episodes: IntArray) -> "Said":
-        """Return rows of the k episodes."""
-        return Said(*(array[episodes] for array in self))
 
 
 def interpreted(
@@ -136,10 +134,13 @@ class LoopReadings:
         self.interval = corridor.loops.interval
         self.stations = Stations.of(corridor.loops, corridor.geometry)
         segments, place = np.unique(self.stations.beside, return_inverse=True)
-        self._channels = task.queries.channels_of_segments(corridor)[segments]
-        self._releases_flow = task.releases_flow
-        self._segments, self._limit = segments, road.limits[segments]
-        self._least_density = 1.0 / road.lengths[segments]
+        channels = task.queries.channels_of_segments(corridor)[segments]
+        least_density = 1.0 / road.lengths[segments]
+        self._places = Bundle(Places(channels, segments, least_density, task.releases_flow))
+        self._limit = road.limits[segments]
+        # np.empty takes address space, not memory, until traffic is loaded.
+        self._said = np.empty((*traffic.readings.shape[:2], segments.size, 4))
+        self._loaded = np.zeros(len(traffic.seeds), dtype=bool)
         # Pairs of a station and a segment beside it.
         pairs = np.arange(len(self.stations.beside)).repeat(2), place.reshape(-1)
         self._station, self._place = np.unique(np.array(pairs), axis=1)
@@ -184,32 +185,71 @@ class LoopReadings:
         means: FloatArray = np.where(n > 0.0, total, np.nan) / np.maximum(n, 1.0)
         return means
 
-    def added(self, measured: Measurement, said: Said) -> Measurement:
-        """Return the measurement of a second with what readings say of it.
+    def load(self, indices: IntArray) -> None:
+        """Make what is said in each second of all intervals, of traffic that is loaded, once."""
+        for index in np.unique(indices[~self._loaded[indices]]).tolist():
+            said = self.said(self._traffic.readings[index])
+            density_std = said.density_std * np.sqrt(said.density_alike)
+            speed_std = said.speed_std * self.interval**0.5
+            self._said[index] = np.stack([said.density, said.speed, density_std, speed_std], -1)
+            self._loaded[index] = True
+
+    def said_until(self, traffic: IntArray, times: IntArray) -> FloatArray:
+        """Return what is said in each second of the intervals that end at seconds (k,).
+
+        Returns:
+            Density, speed and deviations of both, shape (k, L, 4); NaN where nothing is said.
+        """
+        found: FloatArray = self._said[traffic, times // self.interval - 1]
+        return found
+
+    def added(self, measured: Measurement, said: FloatArray) -> Measurement:
+        """Return the measurement of some seconds with what readings say of each of them.
 
         Where a segment is measured in the same second, both are weighed by their variances.
+
+        Args:
+            measured: Of m seconds of k episodes, one after the other, m k rows.
+            said: What `said_until` returns of the k episodes.
         """
-        density, speed = said.density, said.speed
-        density_std = said.density_std * np.sqrt(said.density_alike)
-        speed_std = said.speed_std * self.interval**0.5
-        second, second_std = speed, speed_std
-        centre = measured.centre[:, self._segments]
-        if self._releases_flow:
-            second, slip = density * (speed - centre), speed - centre
-            least = np.maximum(density, self._least_density)
-            second_std = np.hypot(least * speed_std, slip * density_std)
-        own = np.stack([density, second], axis=-1)
-        variance = np.stack([density_std, second_std], axis=-1) ** 2
-        values, sigma = measured.values.copy(), measured.sigma.copy()
-        observed, known = measured.observed.copy(), np.isfinite(density)
-        seen = observed[:, self._channels]
-        noise = sigma[:, self._channels] ** 2
-        # The weight of the reading: all where nothing else is known, none where it is silent.
-        share = np.where(seen[..., None], noise / (noise + variance), 1.0)
-        share[~known] = 0.0
-        others = np.where(seen[..., None], values[:, self._channels], 0.0)
-        values[:, self._channels] = (1.0 - share) * others + share * np.where(share > 0.0, own, 0.0)
-        merged = np.where(seen[..., None], share * variance, variance)
-        sigma[:, self._channels] = np.sqrt(np.where(known[..., None], merged, noise))
-        observed[:, self._channels] |= known
+        observed, values, sigma = merge(self._places, measured, said)
         return measured._replace(observed=observed, values=values, sigma=sigma)
+
+
+class Places(NamedTuple):
+    """The L segments that readings say something of."""
+
+    channel: IntArray  # (L,)
+    segment: IntArray  # (L,)
+    least_density: FloatArray  # (L,) one vehicle [veh/km]
+    releases_flow: bool
+
+
+@kernel
+def merge(
+    bundle: Any, measured: Measurement, said: FloatArray
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Return the first fields of a `Measurement`, see `LoopReadings.added`."""
+    (places,) = bundle.parts
+    observed, values = measured.observed.copy(), measured.values.copy()
+    sigma = measured.sigma.copy()
+    for row in range(len(observed)):
+        for i in range(places.channel.size):
+            density, speed, density_std, speed_std = said[row % len(said), i]
+            if np.isnan(density):
+                continue
+            second, second_std, c = speed, speed_std, places.channel[i]
+            if places.releases_flow:
+                slip = speed - measured.centre[row, places.segment[i]]
+                second, carrier = density * slip, max(density, places.least_density[i])
+                second_std = math.hypot(carrier * speed_std, slip * density_std)
+            for j, value, std in ((0, density, density_std), (1, second, second_std)):
+                if observed[row, c]:
+                    noise = sigma[row, c, j] ** 2
+                    share = noise / (noise + std**2)  # of the reading
+                    values[row, c, j] = (1.0 - share) * values[row, c, j] + share * value
+                    sigma[row, c, j] = math.sqrt(share) * std
+                else:
+                    values[row, c, j], sigma[row, c, j] = value, std
+            observed[row, c] = True
+    return observed, values, sigma

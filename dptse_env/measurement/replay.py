@@ -111,13 +111,13 @@ class Replay:
         diverged, fallback = estimator.diverged[episodes], estimator.fallback[episodes]
         for kept, array in zip(self._kept, estimator.memory, strict=True):
             array[episodes] = kept[episodes]
-        said = self._loops.said(self._loops.last(traffic, times))
+        said = self._loops.said_until(traffic, times)
         interval, size = self._loops.interval, max(BLOCK // k, 1)
         for begin in range(first[0], interval, size):
             seconds = np.arange(begin, min(begin + size, interval))
             inputs, observed, values, sigma, centre = recall(self._log, seconds, episodes)
             measured = Measurement(observed, values, sigma, centre)
-            given = self._loops.added(measured, said.at(np.tile(np.arange(k), len(seconds))))
+            given = self._loops.added(measured, said)
             # Episodes that began within the interval join in later.
             for i, n in enumerate(np.searchsorted(first, seconds, "right").tolist()):
                 live = episodes[:n]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.estimators import ESTIMATORS, REFERENCES, Estimate, Estimator
+from dptse_env.estimators import ESTIMATORS, REFERENCES, Estimate, Estimator, Measurement
 from dptse_env.process import QueryProcess
 from dptse_env.utils.threads import SMALLEST_BLOCK
 from tests.helpers import COUNTED, PAID, SHORT, assert_same, fast_and_slow, lock_step, make_batch
@@ -69,9 +69,8 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_every_second(estimato
         process.step(ALL, action)
         for episode in ALL[process.time % T == 0]:
             own = np.array([episode])
-            interval = process.time[own] // T - 1
             loops = process.loops
-            said = loops.said(loops.read(process.traffic_index[own], interval))
+            said = loops.said_until(process.traffic_index[own], process.time[own])
             for inputs, measured in given[episode]:
                 by_hand.predict(own, inputs)
                 by_hand.update(own, loops.added(measured, said))
@@ -83,6 +82,36 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_every_second(estimato
                 np.testing.assert_array_equal(mine[own], other[own])
             n_ends += 1
     assert n_ends == 4 + 4 + 4 + 5
+
+
+@pytest.mark.parametrize("privacy", ["printed", COUNTED])
+def test_what_is_known_of_a_segment_in_a_second_is_weighed_by_its_variance(privacy):
+    process = begun(privacy=privacy, loops=LOOPS | {"least_count": 0})
+    task, loops, generator = process.release.task, process.loops, np.random.default_rng(0)
+    shape = len(ALL) * 2, task.n_channels
+    measured = Measurement(
+        generator.random(shape) < 0.5, *generator.uniform(1.0, 90.0, (2, *shape, 2)),
+        generator.uniform(20.0, 90.0, (shape[0], task.n_cells)),
+    )  # fmt: skip
+    said = loops.said_until(process.traffic_index, np.array([2, 5, 9, 20]) * T)
+    given = loops.added(measured, said)
+    beside = np.unique(loops.stations.beside)
+    rest = np.setdiff1d(np.arange(task.n_channels), beside)
+    for own, other in zip(given[:3], measured[:3], strict=True):
+        np.testing.assert_array_equal(own[:, rest], other[:, rest])
+    assert np.isfinite(said[..., 0]).all()
+    assert given.observed[:, beside].all()
+    density, speed, density_std, speed_std = np.moveaxis(np.tile(said, (2, 1, 1)), -1, 0)
+    if task.releases_flow:
+        slip = speed - measured.centre[:, beside]
+        least = np.maximum(density, 1.0 / process.config.corridor.road.lengths[beside])
+        speed_std = np.hypot(least * speed_std, slip * density_std)
+        speed = density * slip
+    own, weight = np.stack([density, speed], -1), np.stack([density_std, speed_std], -1) ** -2.0
+    other = measured.sigma[:, beside] ** -2.0 * measured.observed[:, beside, None]
+    mean = (weight * own + other * measured.values[:, beside]) / (weight + other)
+    np.testing.assert_allclose(given.values[:, beside], mean)
+    np.testing.assert_allclose(given.sigma[:, beside], (weight + other) ** -0.5)
 
 
 def test_readings_come_at_the_ends_of_intervals_alone():
