@@ -253,15 +253,23 @@ def test_a_vehicle_alone_shows_unless_its_interval_reports_nothing(least_count):
     assert unlike(env) == (least_count < 2)
 
 
-def test_a_reading_shows_when_its_interval_has_ended_and_not_before():
+@pytest.mark.parametrize(
+    ("preset", "estimator", "schedule"),
+    fast_and_slow(
+        [("paced", "ekf", None), *itertools.product(IDS, ("ukf", "blend"), BLIND_SCHEDULES)],
+        [("paced", "ekf", None), ("paced", "blend", "expected-reduction"),
+         ("capped", "ukf", "greedy-trace"), ("printed", "ukf", "shift-ahead")],
+    ),
+)  # fmt: skip
+def test_a_reading_shows_when_its_interval_has_ended_and_not_before(preset, estimator, schedule):
     def trips(corridor):
         generator, shape = np.random.default_rng(0), (80, corridor.conditions.duration + 1)
         places = generator.integers(0, corridor.geometry.n_mainline, (2, *shape))
         places[:, :, :30] = 0  # ahead of the loop, which a vehicle passes once
         return zip(places, generator.uniform(5.0, 100.0, places.shape), strict=True)
 
-    env = make_beside_loops("paced", trips)
-    first, second = (transcript(env, seed) for seed in SEEDS)
+    env = make_beside_loops(preset, trips, estimator=estimator)
+    first, second = (transcript(env, seed, schedule) for seed in SEEDS)
     # An episode begins in second 15; the interval in which traffic changes ends in second 35.
     assert same(first[:20], second[:20])
     assert not same(first[:21], second[:21])
