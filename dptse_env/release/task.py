@@ -156,8 +156,9 @@ class Task:
         """
         has_loops = self.corridor.loops is not None
         protected = f"{what}, {change.reports if has_loops else change.rows}"
-        if not self.is_whole:
-            protected += ", under queries and fixed sensors together"
+        if len(self.groups) > 1:
+            others = "fixed sensors" if self.corridor.fixed_sensors else "boundary segments"
+            protected += f", under queries and {others} together"
         if has_loops:
             return f"the reports of a connected vehicle: {protected}"
         return protected if self.is_whole else f"a connected vehicle: {protected}"

@@ -88,6 +88,28 @@ def test_without_loops_a_report_protects_presence_and_names_no_loops(privacy, ke
     assert "loops" not in str(found)
 
 
+@pytest.mark.parametrize("loops", [None, {"positions": [0.5]}])
+@pytest.mark.parametrize(
+    ("sensors", "boundary", "together"),
+    [
+        ((), "nominal", ""),
+        ((), "private", ", under queries and boundary segments together"),
+        ((3,), "private", f", {TOGETHER}"),
+    ],
+)
+def test_a_report_names_those_alone_who_see_a_vehicle(sensors, boundary, together, loops):
+    keywords = {
+        "penetration": 0.2, "corridor": {"fixed_sensors": sensors}, "loops": loops,
+        "privacy": {"preset": "paced", "boundary_inputs": boundary},
+    }  # fmt: skip
+    found = privacy_report(resolve("private-highway", keywords))
+    change = "left out" if loops else "or by none"
+    for said in (found.protects, found.guarantee):
+        after = said.partition(change)[2]
+        assert after.startswith(together)
+        assert ("together" in after) == bool(together)
+
+
 GIVEN = ", given the counts and speeds of the loops, which are public and not protected"
 ALONE = "; a vehicle alone in an interval shows its speed there, as loops.least_count is below 2"
 CHANGES = {
