@@ -70,7 +70,7 @@ class Loops:
             inside = position <= borders[-1] + TOLERANCE
             require(inside, "corridor.loops.positions", allowed, position)
         for face in self.ramps:
-            known = (*geometry.on_ramps, *geometry.off_ramps)
+            known = tuple(sorted((*geometry.on_ramps, *geometry.off_ramps)))
             allowed = f"faces with a ramp, {known}"
             require(face in known, "corridor.loops.ramps", allowed, face)
         nearest = [borders[each] for each in self.faces(geometry).tolist()]
