@@ -1,7 +1,7 @@
 """Time of an environment's step beside SUMO's second, Gymnasium's vectorisation and sumo-rl.
 
 A step is a second of one episode with the EKF; sumo-rl's takes five seconds, so its time of a
-second is a fifth of it.
+second is a fifth of it. Beside loops intervals of 20 s are lived through again.
 """
 
 from __future__ import annotations
@@ -24,9 +24,14 @@ from dptse_env.traffic.sumo import running
 from dptse_env.traffic.sumo import seconds as seconds_of
 from dptse_env.utils.threads import n_cores
 
+LOOPS = {"loops": {"positions": [0.0, 0.5, 1.0, 1.5], "interval": 20}}
+
 
 def measure(*, quick: bool = False) -> list[Row]:
-    """Return the rows of all environments; the ratios are to the largest batch on one thread."""
+    """Return the rows of all environments; the ratios are to the largest batch on one thread.
+
+    Those beside loops are to the same without.
+    """
     n, steps, rounds = (2, 2, 2) if quick else (1024, 16, 10)
     keywords = {"traffic_seeds": "0:2" if quick else "0:64", "horizon": 600, "random_start": True}
     base = f"batch of {n:,}"
@@ -39,23 +44,26 @@ def measure(*, quick: bool = False) -> list[Row]:
         }
         if importlib.util.find_spec("sumo_rl"):
             work["sumo-rl, one intersection"] = intersection(60 if quick else 600)
-        env = gym.make(PAPER, **keywords)
-        env.reset(seed=0)
-        actions = sample(env.action_space, 8 if quick else 400)
-        work["one episode"] = repeating(env, actions, 1, env.reset)
+        for name, more in (("one episode", {}), ("one episode, loops", LOOPS)):
+            env = gym.make(PAPER, **keywords, **more)
+            env.reset(seed=0)
+            actions = sample(env.action_space, 8 if quick else 400)
+            work[name] = repeating(env, actions, 1, env.reset)
         for mode in ("sync", "async"):
             envs = gym.make_vec(PAPER, num_envs=8, vectorization_mode=mode, **keywords)
             envs.reset(seed=0)
             actions = sample(envs.action_space, 4 if quick else 100)
             work[f"{mode} vectorisation, 8 episodes"] = repeating(envs, actions, 8)
-        work["batch of 64"] = stepping(make_batch(PAPER, 64, **keywords), 4 * steps)
+        for name, more in (("batch of 64", {}), ("batch of 64, loops", LOOPS)):
+            work[name] = stepping(make_batch(PAPER, 64, **keywords, **more), 4 * steps)
         work[base] = stepping(make_batch(PAPER, n, **keywords), steps)
         if n_cores() > 1:
             batch = make_batch(PAPER, n, threads=None, **keywords)
             work[f"{base}, {n_cores()} threads"] = stepping(batch, steps)
         work[f"{base}, PrivateHighway"] = stepping(make_batch(PRIVATE, n, **keywords), steps)
         times = take_turns(work, rounds)
-    return compare(times, {name: base for name in times if name != base})
+        bases = {f"{name}, loops": name for name in ("one episode", "batch of 64")}
+    return compare(times, {name: bases.get(name, base) for name in times if name != base})
 
 
 def simulate(corridor: Corridor) -> None:
