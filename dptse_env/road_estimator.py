@@ -9,7 +9,6 @@ their variances. What nobody saw is as predicted.
 from __future__ import annotations
 
 import dataclasses
-import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -52,13 +51,14 @@ _NO_QUERIES = {
 """Keywords that a road file may have for queries, which nobody asks here."""
 
 
-class Entry(NamedTuple):
-    """What a source adds to the stream."""
+class Entries(NamedTuple):
+    """What sources of one interval add to K cells of the stream."""
 
-    before: int  # the second before its interval, or before what can still change
+    before: int  # the second before the interval, or before what can still change
     until: int
-    cells: IntArray  # segments, and boundary segments beside them if it knows both quantities
-    added: FloatArray  # (cells, 2, 2) weights 1 / std^2 and weighted values of both quantities
+    # (K,) segments, and boundary segments beside them where a source knows both quantities
+    cells: IntArray
+    added: FloatArray  # (K, 2, 2) weights 1 / std^2 and weighted values of both quantities
 
 
 class RoadEstimator:
@@ -148,7 +148,7 @@ class RoadEstimator:
         integer("time", now, -LATEST, LATEST)
         is_sequence = isinstance(seen, Iterable) and not isinstance(seen, str | bytes)
         require(is_sequence, "seen", "a sequence of what station() and others return", seen)
-        entries = [self._entry(f"seen[{i}]", each, now) for i, each in enumerate(seen)]
+        entries = self._entries(list(seen), now)
         while now - self.time > LONGEST:
             self._go_on(self.time + LONGEST, [])
         self._go_on(now, entries)
@@ -210,44 +210,58 @@ class RoadEstimator:
         """Return what must be alike where a state is loaded."""
         return {"format": FORMAT, "version": numbers_of(code_version()), **self._made_of}
 
-    def _entry(self, path: str, each: Any, now: int) -> Entry:
-        """Return what a source adds to the stream at second `now`, or refuse it."""
-        require(isinstance(each, Seen), path, "what station(), probes() or Seen() returns", each)
-        until, oldest = now if each.until is None else each.until, max(now - LONGEST, self._start)
-        allowed = f"in {oldest + 1}..{now}, which can still change"
-        require(oldest < until <= now, f"{path}.until", allowed, until)
-        before, cells = max(until - each.seconds, oldest), self._segments(path, each)
-        added = self._weighted(each, cells)
-        at_ends = np.isin(self.corridor.road.beside, cells[added[:, :, 0].all(axis=1)])
-        beside = np.searchsorted(cells, self.corridor.road.beside[at_ends])
-        ends = self.model.n_segments + np.flatnonzero(at_ends)
-        return Entry(
-            before, until, np.concatenate([cells, ends]), np.concatenate([added, added[beside]])
-        )
+    def _entries(self, seen: Sequence[Any], now: int) -> list[Entries]:
+        """Return what sources add to the stream at second `now`, or refuse them."""
+        spans: dict[tuple[int, int], list[tuple[Seen, IntArray]]] = {}
+        for i, each in enumerate(seen):
+            path, allowed = f"seen[{i}]", "what station(), probes() or Seen() returns"
+            require(isinstance(each, Seen), path, allowed, each)
+            until, oldest = each.until, max(now - LONGEST, self._start)
+            until = now if until is None else until
+            allowed = f"in {oldest + 1}..{now}, which can still change"
+            require(oldest < until <= now, f"{path}.until", allowed, until)
+            span = max(until - each.seconds, oldest), until
+            spans.setdefault(span, []).append((each, self._segments(path, each)))
+        return [
+            Entries(*span, *self._added(*zip(*own, strict=True))) for span, own in spans.items()
+        ]
 
-    def _weighted(self, each: Seen, segments: IntArray) -> FloatArray:
-        """Return weights and weighted values of a source on segments, (k, 2, 2)."""
-        road, seconds = self.corridor.road, each.seconds
-        # An interval counts once: errors of its seconds are alike. Of what a flow says they are not
-        # alike as far as numbers on a segment vary, which filters on the traffic model take for
-        # waves.
-        alike = np.full((2, 1), float(seconds))
-        if each.flow is None:
-            pairs = [(each.density, each.density_std), (each.speed, each.speed_std)]
-            told = [[math.nan if x is None else x for x in pair] for pair in pairs]
-            values, stds = np.array(told).T[..., None]
-        else:
-            speed = math.nan if each.speed is None else each.speed
+    def _added(
+        self, seen: Sequence[Seen], places: Sequence[IntArray]
+    ) -> tuple[IntArray, FloatArray]:
+        """Return what sources add to cells, given the segments of each of them."""
+        fields = ((x.density, x.speed, x.density_std, x.speed_std, x.flow, x.seconds) for x in seen)
+        told = np.array([*fields], dtype=np.float64)  # NaN for None
+        segments = np.concatenate(places)
+        added = self._weighted(told.repeat([*map(len, places)], axis=0), segments)
+        own, end = np.nonzero(segments[:, None] == self.corridor.road.beside)
+        knows_both = added[own, :, 0].all(axis=1)
+        cells = np.concatenate([segments, self.model.n_segments + end[knows_both]])
+        return cells, np.concatenate([added, added[own[knows_both]]])
+
+    def _weighted(self, told: FloatArray, segments: IntArray) -> FloatArray:
+        """Return weights and weighted values of what K segments are told, (K, 2, 2).
+
+        Args:
+            told: Density, speed, their deviations, flow and seconds, (K, 6), NaN for none.
+            segments: Shape (K,).
+        """
+        road, seconds = self.corridor.road, told[:, 5]
+        values, stds, flow = told[:, :2].T, told[:, 2:4].T, told[:, 4]
+        # An interval counts once, since errors of its seconds are alike. In what a flow says the
+        # number on a segment varies, too, which filters on the traffic model take for waves.
+        alike, by_flow = np.stack([seconds, seconds]), ~np.isnan(flow)
+        if by_flow.any():
             said = interpreted(
-                np.array(each.flow), np.array(speed), seconds, road.lanes[segments],
+                flow, values[1], seconds.astype(np.int64), road.lanes[segments],
                 road.lengths[segments], road.limits[segments], segments >= road.n_mainline,
             )  # fmt: skip
-            values, stds = np.stack(said[:2]), np.stack(said[2:4])
+            values = np.where(by_flow, np.stack(said[:2]), values)
+            stds = np.where(by_flow, np.stack(said[2:4]), stds)
             if not self._estimator.steps_model:
-                alike = np.stack([said.density_alike, np.full(len(segments), float(seconds))])
+                alike[0] = np.where(by_flow, said.density_alike, seconds)
         weights = np.nan_to_num(1.0 / (alike * stds**2))
-        added = np.stack([weights, weights * np.nan_to_num(values)], axis=-1)
-        return np.broadcast_to(added.swapaxes(0, 1), (len(segments), 2, 2))
+        return np.stack([weights, weights * np.nan_to_num(values)], axis=-1).swapaxes(0, 1)
 
     def _segments(self, path: str, each: Seen) -> IntArray:
         """Return the segments that a source says something of."""
@@ -273,13 +287,14 @@ class RoadEstimator:
         low, high = max(face - 1, 0), min(face + 1, n)
         return np.arange(first + low, first + high)
 
-    def _go_on(self, now: int, entries: Sequence[Entry]) -> None:
+    def _go_on(self, now: int, entries: Sequence[Entries]) -> None:
         """Go on to second `now`, from before what has changed."""
         self._stream[np.arange(self.time + 1, now + 1) % N_ROWS] = 0.0
         changed = self.time
         for before, until, cells, added in entries:
-            rows = np.arange(before + 1, until + 1) % N_ROWS
-            self._stream[rows[:, None], cells] += added
+            total = np.zeros(self._stream.shape[1:])
+            np.add.at(total, cells, added)  # a cell may be there several times
+            self._stream[np.arange(before + 1, until + 1) % N_ROWS] += total
             changed = min(changed, before)
         back = max(second for second in self._kept if second <= changed)
         if back < self.time:

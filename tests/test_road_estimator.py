@@ -209,6 +209,52 @@ def test_nobody_says_anything_for_two_hours():
     assert road.time == 7100
 
 
+ROAD_FILE = """
+n_mainline = 3
+exit_shares = []
+duration = 60
+average_dwell = 5.0
+fixed_sensors = [0]
+loops = { positions = [0, 0.1] }
+demand = { mainline = [[0, 1000]], on_ramps = [] }
+[environment]
+estimator = "ekf"
+estimator_settings = { asm = { length = 0.2 } }
+parameters = "published"
+privacy = "paced"
+bandwidth = 2
+query_spans = [1, 2]
+penetration = 0.2
+detectors = { factor = 1.1 }
+traffic_seeds = "0:3"
+"""
+
+
+def test_a_road_file_gives_road_parameters_and_settings_and_no_queries(tmp_path):
+    path = tmp_path / "road.toml"
+    path.write_text(ROAD_FILE, encoding="utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # nothing is taken from another road
+        road = RoadEstimator(str(path), "asm")
+    assert road.model.parameters.name == "published"
+    settings = {"asm": {"length": 0.2}}
+    same = RoadEstimator(road.corridor, "asm", parameters="published", estimator_settings=settings)
+    same.load(road.save())
+    road.step([Seen(0.0, 0.3, 40.0, 80.0, 5.0, 5.0)])
+    assert bits(road).shape == (4, 3)
+
+
+class Forgetful(ESTIMATORS.find("random_walk")):
+    """An estimator that does not say what it remembers."""
+
+    _memory = Estimator._memory
+
+
+def test_an_estimator_that_cannot_go_back_is_refused():
+    with pytest.raises(ValueError, match=r"^estimator must have _memory .*Forgetful"):
+        make(Forgetful)
+
+
 def test_what_comes_in_after_a_long_gap_counts_at_its_end_alone():
     at_once, in_steps = (played(make(), 120) for _ in range(2))
     at_once.step(loops(4, seconds=600), seconds=5000)

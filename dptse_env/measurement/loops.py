@@ -58,7 +58,7 @@ class Said(NamedTuple):
 def interpreted(
     flow: FloatArray,
     speed: FloatArray,
-    interval: int,
+    interval: IntArray | int,
     lanes: FloatArray | float,
     length: FloatArray | float,
     limit: FloatArray | float,
