@@ -214,6 +214,7 @@ def describe_road(corridor: Corridor) -> str:
     if loops is not None:
         places = [*map("{:g}".format, loops.positions), *(f"ramp {face}" for face in loops.ramps)]
         beside = f", loops at {', '.join(places)} every {loops.interval} s"
+        beside += f" (least count {loops.least_count})" if loops.least_count else ""
     return (
         f"{corridor.name} ({corridor.geometry.n_mainline} mainline segments of {length:g} km, "
         f"{corridor.geometry.most_lanes} lanes, fixed sensors on {list(corridor.fixed_sensors)}"

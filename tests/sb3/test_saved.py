@@ -212,6 +212,10 @@ def test_the_card_describes_the_policy(stored):
             {"loops": {"positions": [0.2], "ramps": [4]}},
             r"sensors on \[5, 7\]\), .* sensors on \[5, 7\], loops at 0.2, ramp 4 every 20 s\)",
         ),
+        (
+            {"loops": {"positions": [0.2], "least_count": 5}},
+            r"loops at 0.2 every 20 s \(least count 5\)\), traffic",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore:privacy.preset")
