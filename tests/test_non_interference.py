@@ -266,6 +266,7 @@ def test_a_reading_shows_when_its_interval_has_ended_and_not_before(preset, esti
         generator, shape = np.random.default_rng(0), (80, corridor.conditions.duration + 1)
         places = generator.integers(0, corridor.geometry.n_mainline, (2, *shape))
         places[:, :, :30] = 0  # ahead of the loop, which a vehicle passes once
+        places[1, :20] = 0  # so that the numbers that pass differ, too
         return zip(places, generator.uniform(5.0, 100.0, places.shape), strict=True)
 
     env = make_beside_loops(preset, trips, estimator=estimator)
