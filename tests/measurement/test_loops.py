@@ -157,14 +157,15 @@ def errors(seeds, **keywords):
     return np.mean(found[60:], axis=0)
 
 
-WORSE = {("asm", 1.0), ("ekf", 0.2), ("blend", 0.2)}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("penetration", [1.0, 0.2])
 @pytest.mark.parametrize("estimator", ["recurrent", "ekf", "ukf", "enkf", "mhe", "blend", "asm"])
 def test_loops_make_no_estimate_worse(estimator, penetration):
-    """The upper end of the interval of the error's growth is below 2 %, paired over 32 seeds."""
+    """The upper end of the interval of the error's growth is below 2 %, paired over 32 seeds.
+
+    Adaptive smoothing, which has no traffic model, loses more where every vehicle answers, and the
+    MHE differs from seed to seed too much to tell.
+    """
     given = {"estimator": estimator, "bandwidth": 5}
     if penetration < 1.0:
         given |= {"penetration": penetration}
@@ -176,4 +177,5 @@ def test_loops_make_no_estimate_worse(estimator, penetration):
         loops = {"positions": [0.0, 0.5, 1.0, 1.5], "interval": interval}
         growth = errors(seeds, **given, loops=loops) / without.mean() - without / without.mean()
         half = 2.04 * growth.std(ddof=1) / len(growth) ** 0.5
-        print(estimator, penetration, interval, f"{growth.mean():.3f} +- {half:.3f}")
+        most = {"asm": 0.07, "mhe": 0.06}.get(estimator, 0.02)
+        assert growth.mean() + half < most, (interval, growth.mean(), half)
