@@ -245,16 +245,25 @@ def _part(registry: Registry, _path: str, value: Any, _base: Any) -> Any:
 
 
 def _corridor(path: str, value: Any, base: Corridor) -> Corridor:
-    """Return a corridor: by name, an object, or fields that replace those of the preset's.
+    """Return a corridor: by name, an object, or fields that replace those of the preset's."""
+    if isinstance(value, Mapping):
+        corridor = _changed(path, value, base)
+    else:
+        found = CORRIDORS.find(value)
+        corridor = found() if callable(found) else found
+        require(isinstance(corridor, Corridor), path, "a Corridor, or what returns one", corridor)
+    passed = "None on a road of measured fields, which say of nobody that he passes"
+    countable = corridor.loops is None or has_vehicles(corridor.recordings)
+    require(countable, f"{path}.loops", passed, corridor.loops)
+    return corridor
+
+
+def _changed(path: str, value: Mapping[str, Any], base: Corridor) -> Corridor:
+    """Return a corridor with other fields.
 
     Demand and incident may be ``"preset"``, for the road's own, or ``"random"``, drawn anew for
     every traffic seed; an incident also ``"none"``.
     """
-    if not isinstance(value, Mapping):
-        found = CORRIDORS.find(value)
-        made: Corridor = found() if callable(found) else found
-        require(isinstance(made, Corridor), path, "a Corridor, or what returns one", made)
-        return made
     names = {"demand": ("preset", "random"), "incident": ("preset", "random", "none")}
     named = {key: value[key] for key in names if isinstance(value.get(key), str)}
     fields = {key: each for key, each in value.items() if key not in named}
@@ -264,9 +273,6 @@ def _corridor(path: str, value: Any, base: Corridor) -> Corridor:
         source = randomised(corridor) if name == "random" else corridor
         given = None if name == "none" else getattr(source.conditions, key)
         corridor = corridor.replaced(**{key: given})
-    passed = "None on a road of measured fields, which say who passes of nobody"
-    countable = corridor.loops is None or has_vehicles(corridor.recordings)
-    require(countable, f"{path}.loops", passed, corridor.loops)
     return corridor
 
 
