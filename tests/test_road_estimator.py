@@ -368,6 +368,7 @@ REFUSED = [
     ),
     (loops(0, until=131), r"seen\[0\]\.until must be in 1\.\.130, .*, got 131"),
     (loops(0, until=0), r"seen\[0\]\.until must be in 1\.\.130, .*, got 0"),
+    (loops(0, until=10**400), r"seen\[0\]\.until must be in .*, got an integer of 400 digits"),
     ([*loops(0), (0.1, 0.2)], r"seen\[3\] must be what station\(\), .*, got \(0\.1, 0\.2\)"),
     (Seen(0.1, 0.1, speed=90, speed_std=9), "seen must be a sequence"),
     ("abc", "seen must be a sequence"),

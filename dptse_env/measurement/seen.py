@@ -145,6 +145,6 @@ def probes(
     Raises:
         ValueError: A value is out of range.
     """
-    n = integer("probes.vehicles", vehicles, 1)
+    n = integer("probes.vehicles", vehicles, 1, 10**6)
     std = max(inside("probes.spread", spread, 0.0, 1e3) / n**0.5, 0.1)
     return Seen(start, end, None, speed, None, std, seconds, until, ramp)

@@ -59,6 +59,7 @@ class Interval:
 
 POSITIVE = Interval(0, math.inf, open_low=True, open_high=True)
 """The finite numbers above zero."""
+_FINITE = Interval(-math.inf, math.inf, open_low=True, open_high=True)
 
 
 def from_mapping(cls: type[T], values: Any, path: str, base: T | None = None) -> T:
@@ -181,7 +182,7 @@ def number(kind: type[N], value: Any, path: str, interval: Interval | None) -> N
             converted = kind(value) if is_number and not isinstance(value, bool) else math.nan
         except OverflowError:
             converted = math.nan
-    if converted in interval if interval is not None else math.isfinite(converted):
+    if converted in (_FINITE if interval is None else interval):
         return typing.cast(N, converted)
     raise ValueError(f"{path} must be {allowed_numbers(kind, interval)}, got {shown(value)}")
 

@@ -54,7 +54,8 @@ def test_a_reading_that_cannot_be_is_refused():
 
 
 PROBES = [
-    ({"vehicles": 0}, r"probes\.vehicles must be an integer >= 1, got 0"),
+    ({"vehicles": 0}, r"probes\.vehicles must be an integer in 1\.\.1000000, got 0"),
+    ({"vehicles": 10**400}, r"probes\.vehicles must be an integer in .*, got an integer of 400 "),
     ({"spread": 0}, r"probes\.spread must be a number in \(0, 1000\), got 0"),
     ({"speed": NAN}, r"seen\.speed must be a number in \[0, 1000\] or None, got nan"),
     ({"start": 0.3}, r"seen\.end must be >= start, 0\.3 km, got 0\.2"),

@@ -94,6 +94,9 @@ def test_numbers_come_back_plain_and_bad_ones_are_named():
     for value in (0, 6, 1.0, "1", True, None):
         with pytest.raises(ValueError, match=rf"^n must be .*, got {value!r}$"):
             validation.integer("n", value, 1, 5)
+    assert validation.convert(int, 10**400, "n") == 10**400
+    with pytest.raises(ValueError, match=r"^n must be a finite number, got an integer of 400 "):
+        validation.convert(float, 10**400, "n")
 
 
 def test_values_are_shown_in_one_short_line():
