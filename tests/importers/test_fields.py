@@ -87,7 +87,7 @@ def test_environments_play_a_field_and_refuse_what_needs_vehicles(tmp_path):
             gym.make("dptse_env:dptse/PaperHighway-v0", corridor=path, bandwidth=2, privacy=preset)
     with_loops = read_corridor(path).replaced(loops={"positions": [0.0]})
     for keywords in ({"corridor": path, "loops": with_loops.loops}, {"corridor": with_loops}):
-        with pytest.raises(ValueError, match=r"^corridor\.loops must be None on a road of measured"):
+        with pytest.raises(ValueError, match=r"^corridor\.loops must be None on a road of .*"):
             gym.make("dptse_env:dptse/PaperHighway-v0", bandwidth=2, **keywords)
 
 
