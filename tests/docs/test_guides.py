@@ -10,11 +10,14 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
+from dptse_env import RoadEstimator
 from dptse_env.policies import read_policy
 from dptse_env.traffic import read_corridor
 from tests.helpers import ROOT
@@ -154,6 +157,10 @@ def test_a_stream_is_followed_and_compared_with_straight_lines(run_guide):
     printed, names = run_guide("your-own-stream.md")
     assert names["again"].time == 1800
     assert re.search(r"^asm: \d+\.\d km/h, (no )?better than straight lines, ", printed, re.M)
+    gaps = names["table"].sample(fraction=0.9, seed=0).sort("second", "km")
+    road = partial(RoadEstimator, "motorway.toml", "random_walk", start=names["start"])
+    errors = names["left_out"](gaps, lambda _: road())
+    assert np.isfinite(errors).all()
 
 
 @pytest.mark.slow
