@@ -177,6 +177,8 @@ class RoadEstimator:
     def load(self, state: bytes) -> None:
         """Go on where another one, made alike, was saved, with the same bits.
 
+        A digest finds damage, not forgery: load states that you trust alone.
+
         Raises:
             ValueError: It is damaged, or of another road, estimator, setting or version. Nothing
                 has changed then.
