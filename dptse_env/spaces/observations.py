@@ -23,6 +23,7 @@ from dptse_env.traffic.loops import Stations, borders_of
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 from dptse_env.utils.units import HOUR
+from dptse_env.utils.validation import require
 
 AGE_CAP = 60
 """Largest age of a segment [s] that observations distinguish."""
@@ -287,13 +288,15 @@ class ObservationEncoding:
             picks_one_by_one: Whether a decision takes several actions.
 
         Raises:
-            ValueError: There is no such block, it lacks a method, or two have the same name.
+            ValueError: There is no such block, it lacks a method, two have the same name, or none
+                has a number.
         """
         self.task = task
         defaults = default_blocks(task, picks_one_by_one=picks_one_by_one)
         names = [name for value in blocks for name in _expanded(value, defaults)]
         self.blocks: tuple[Block | ObservationBlock, ...] = tuple(map(_made, names))
         sizes = [_checked_size(block, task) for block in self.blocks]
+        require(sum(sizes) > 0, "observation", "blocks that have numbers on this road", blocks)
         ends = np.cumsum(sizes).tolist()
         self.slices: dict[str, slice] = {}
         for block, size, end in zip(self.blocks, sizes, ends, strict=True):

@@ -129,3 +129,6 @@ def test_blocks_can_be_chosen_in_any_order_and_stand_once():
     for blocks in (("age", "age"), ("default", "age")):
         with pytest.raises(ValueError, match="observation has two blocks named 'age'"):
             encoding(blocks)
+    for blocks in ((), ("loop_flow",)):
+        with pytest.raises(ValueError, match=r"^observation must be blocks that have numbers on"):
+            encoding(blocks)
