@@ -209,6 +209,7 @@ def test_a_training_by_minutes_ends_in_time(tmp_path, clock):
     assert rows[-1]["steps"] > 0
 
 
+@pytest.mark.slow
 def test_rounds_go_on_for_some_minutes(tmp_path, clock):
     rows = train(make_plan(minutes=0.04), tmp_path)
     ends = np.array([row["seconds"] for row in rows])
@@ -353,6 +354,7 @@ def test_damaged_and_foreign_files_are_refused(whole, tmp_path):
 # --- several trainings ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_trainings_at_once_come_out_as_alone(whole, tmp_path):
     """One of them goes on where a worker was lost, whose task is run again."""
     with pytest.raises(StopError), ended_at(1, stop):
