@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -139,7 +140,8 @@ class RoadEstimator:
 
         Raises:
             ValueError: A place is not on the road, or an interval ended more than ten minutes ago,
-                ends in the future, or ended before the stream began. Nothing has changed then.
+                ends in the future, or ended before the stream began. Nothing has changed then, nor
+                after any other exception, Ctrl-C among them.
 
         Warns:
             UserWarning: A point lies within a segment and counts at its border.
@@ -149,9 +151,11 @@ class RoadEstimator:
         is_sequence = isinstance(seen, Iterable) and not isinstance(seen, str | bytes)
         require(is_sequence, "seen", "a sequence of what station() and others return", seen)
         entries = self._entries(list(seen), now)
-        while now - self.time > LONGEST:
-            self._go_on(self.time + LONGEST, [])
-        self._go_on(now, entries)
+        changed = min([self.time, *(each.before for each in entries)])
+        with self._whole(range(max(changed, now - N_ROWS) + 1, now + 1)):
+            while now - self.time > LONGEST:
+                self._go_on(self.time + LONGEST, [])
+            self._go_on(now, entries)
 
     def estimate(self, delay: int = 0) -> Estimate:
         """Return density [veh/km] and speed [km/h] of every segment, and deviations, (S,) each.
@@ -177,11 +181,12 @@ class RoadEstimator:
     def load(self, state: bytes) -> None:
         """Go on where another one, made alike, was saved, with the same bits.
 
-        A digest finds damage, not forgery: load states that you trust alone.
+        A digest finds damage, not forgery, which may be as wrong as it likes within the ranges of
+        numbers: load states that you trust alone.
 
         Raises:
             ValueError: It is damaged, or of another road, estimator, setting or version. Nothing
-                has changed then.
+                has changed then, nor after any other exception.
         """
         require(isinstance(state, bytes), "state", "the bytes that save() returned", state)
         card, arrays = parse_tensors(state, "state")
@@ -199,14 +204,37 @@ class RoadEstimator:
         with within("state: "):
             require_arrays({k: v for k, v in arrays.items() if k in shapes}, shapes, np.uint8)
             require_arrays({k: v for k, v in arrays.items() if k not in shapes}, stream, float)
-        for i, array in enumerate(memory):
-            array[...] = arrays[f"memory_{i}"].view(array.dtype).reshape(array.shape)
-        self._start, self.time = start, first
-        self._kept = {first: memory}
-        self._stream[np.arange(first + 1, now + 1) % N_ROWS] = arrays["stream"]
-        self._restore(first)
-        self._estimates = {first: self._estimator.estimate()}
-        self._run(first, now)
+            for i, array in enumerate(memory):
+                array[...] = arrays[f"memory_{i}"].view(array.dtype).reshape(array.shape)
+            *of_estimator, ends = memory
+            self._estimator.check_memory(of_estimator)
+            for name, array in (("ends", ends), ("stream", arrays["stream"])):
+                wrong = array[~np.isfinite(array)].tolist()
+                require(not wrong, name, "finite", wrong[:1])
+            with self._whole(range(N_ROWS)):
+                self._start, self.time = start, first
+                self._kept = {first: memory}
+                self._stream[np.arange(first + 1, now + 1) % N_ROWS] = arrays["stream"]
+                self._restore(first)
+                self._estimates = {first: self._estimator.estimate()}
+                self._run(first, now)
+                self._estimator.check_estimate(self._estimates[now])
+
+    @contextmanager
+    def _whole(self, seconds: range) -> Iterator[None]:
+        """Leave all as it was where the body, which changes those of the stream, does not end."""
+        before = self._start, self.time
+        kept, estimates = dict(self._kept), dict(self._estimates)
+        rows = np.array(seconds) % N_ROWS
+        stream = self._stream[rows]
+        try:
+            yield
+        except BaseException:
+            self._start, self.time = before
+            self._kept, self._estimates = kept, estimates
+            self._stream[rows] = stream
+            self._restore(self.time)
+            raise
 
     def _about(self) -> dict[str, str]:
         """Return what must be alike where a state is loaded."""

@@ -353,6 +353,76 @@ def test_a_state_with_other_arrays_is_refused(name):
             road.load(state)
 
 
+def forged(state, forge):
+    """A state whose bytes of the estimator's memory are others, under a digest of their own."""
+    card, arrays = files.parse_tensors(state, "state")
+    del card["sha256"]
+    memory = {name: forge(array) for name, array in arrays.items() if name.startswith("memory")}
+    return files.dump_tensors({**arrays, **memory}, card, "state", 2**30)
+
+
+@pytest.mark.parametrize("estimator", ["mhe", "asm", "recurrent"])
+@pytest.mark.parametrize("byte", [63, 127, 255])
+def test_a_forged_state_is_refused_and_nothing_is_lost(estimator, byte):
+    road = played(make(estimator), 70)
+    before = road.save()
+    with pytest.raises(ValueError, match=r"^state: memory\[\d+\] must be .*, got") as problem:
+        road.load(forged(before, lambda array: np.full_like(array, byte)))
+    assert "\n" not in str(problem.value)
+    assert road.save() == before
+
+
+@pytest.mark.parametrize("field", ["length", "active_set", "solved", "centre"])
+def test_an_index_out_of_range_is_no_memory(field):
+    estimator = make("mhe")._estimator
+    place = [*estimator._windows._fields].index(field) + 3
+    for value, allowed in ((estimator.memory[place].flat[0], True), (-9, False)):
+        memory = [array.copy() for array in estimator.memory]
+        memory[place][...] = value
+        if allowed:
+            estimator.check_memory(memory)
+        else:
+            with pytest.raises(ValueError, match=rf"^memory\[{place}\] must be in .*, got -9"):
+                estimator.check_memory(memory)
+
+
+def test_a_mixture_knows_the_ranges_of_its_experts():
+    experts = {"mixture": {"experts": ["mhe", "asm"]}}
+    memory = played(make("mixture", estimator_settings=experts), 3).save()
+    with pytest.raises(ValueError, match=r"^state: memory\[\d+\] must be in "):
+        make("mixture", estimator_settings=experts).load(
+            forged(memory, lambda array: np.full_like(array, 63))
+        )
+
+
+@pytest.mark.parametrize("problem", [KeyboardInterrupt, RuntimeError])
+def test_a_step_or_a_restart_that_ends_early_changes_nothing(monkeypatch, problem):
+    road, same = (played(make("ekf"), 130) for _ in range(2))
+    before, other = road.save(), played(make("ekf"), 700).save()
+    predict, steps = Estimator.predict, []
+
+    def interrupted(*args):
+        steps.append(1)
+        if len(steps) % 30 == 0:
+            raise problem
+        predict(*args)
+
+    for act in (
+        lambda: road.step(loops(9)),
+        lambda: road.step(loops(9), seconds=2000),
+        lambda: road.load(other),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(Estimator, "predict", interrupted)
+            with pytest.raises(problem):
+                act()
+        assert road.save() == before
+    for each in (road, same):
+        each.step(loops(9))
+    assert (bits(road) == bits(same)).all()
+    assert (bits(road, 100) == bits(same, 100)).all()
+
+
 # Bad input
 
 

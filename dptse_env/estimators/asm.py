@@ -514,3 +514,7 @@ class AdaptiveSmoothing(SegmentEstimator):
     @property
     def _memory(self) -> tuple[AnyArray, ...]:
         return self.state[: State._fields.index("innovations")]
+
+    @property
+    def _limits(self) -> tuple[tuple[AnyArray, float, float], ...]:
+        return ((self.state.place, 0, self.state.past.shape[2] - 1),)

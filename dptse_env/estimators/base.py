@@ -19,6 +19,7 @@ from dptse_env.road import Road
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle
 from dptse_env.utils.registry import name_of_class
+from dptse_env.utils.validation import require
 
 Backend = Literal["compiled", "reference"]
 
@@ -143,7 +144,7 @@ class Estimator(ABC):
 
     A subclass has `_reset`, `_predict`, `_update` and `_estimate`. It writes `innovations` and
     `diverged` of the episodes that it updates, and `fallback` too if its update can fail. With
-    `_memory` its episodes can go back in time.
+    `_memory` its episodes can go back in time, and `_limits` say what indexes others in it.
 
     Attributes:
         model: The traffic model.
@@ -273,6 +274,33 @@ class Estimator(ABC):
         raise ValueError(
             f"estimator must have _memory to go back in time, got {name_of_class(type(self))}"
         )
+
+    @property
+    def _limits(self) -> tuple[tuple[AnyArray, float, float], ...]:
+        """Arrays of `_memory` that index others, or may be NaN, with their least and largest."""
+        return ()
+
+    def check_memory(self, memory: Sequence[AnyArray]) -> None:
+        """Refuse numbers that no past leaves; kernels index by some of them, unchecked.
+
+        Args:
+            memory: Arrays of the types and shapes of `memory`.
+
+        Raises:
+            ValueError: A number is not finite, an index is out of range, or a flag is neither 0
+                nor 1.
+        """
+        limits = {id(array): (low, high) for array, low, high in self._limits}
+        for i, (own, given) in enumerate(zip(self.memory, memory, strict=True)):
+            numbers = given.view(np.uint8) if given.dtype == np.bool_ else given
+            allowed, wrong = "finite", ~np.isfinite(numbers)
+            if given.dtype == np.bool_:
+                allowed, wrong = "0 or 1", numbers > 1
+            elif id(own) in limits:
+                low, high = limits[id(own)]
+                allowed, wrong = f"in {low:g}..{high:g}", (numbers < low) | (numbers > high)
+            if wrong.any():
+                require(False, f"memory[{i}]", allowed, numbers[wrong][0].item())
 
     @abstractmethod
     def _reset(

@@ -18,6 +18,7 @@ from dptse_env.estimators.ekf import CovarianceFilter, Filters, initial_variance
 from dptse_env.estimators.linalg import apply, padded
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.estimators.window import (
+    NEWTON,
     UNSOLVED,
     Window,
     evaluate,
@@ -418,6 +419,16 @@ class MHE(CovarianceFilter):
     def _memory(self) -> tuple[AnyArray, ...]:
         windows: tuple[Any, ...] = self._windows[: Windows._fields.index("fallback")]
         return *super()._memory, *windows
+
+    @property
+    def _limits(self) -> tuple[tuple[AnyArray, float, float], ...]:
+        windows = self._windows
+        return (
+            (windows.length, 1, windows.solution.shape[1]),
+            (windows.active_set, -1, 1),
+            (windows.solved, UNSOLVED, NEWTON),
+            (windows.centre, 0.0, np.inf),
+        )
 
     def _restart(self, episodes: IntArray) -> None:
         for episode in episodes.tolist():

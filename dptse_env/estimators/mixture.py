@@ -88,6 +88,10 @@ class Mixture(Estimator):
         of_experts = (array for expert in self.experts for array in expert.memory)
         return *of_experts, self._likelihoods.T, self._priors
 
+    @property
+    def _limits(self) -> tuple[tuple[AnyArray, float, float], ...]:
+        return tuple(limit for expert in self.experts for limit in expert._limits)
+
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
     ) -> None:
