@@ -80,7 +80,7 @@ class RoadEstimator:
         road: Any,
         estimator: Any = "recurrent",
         *,
-        stations: Sequence[float] = (),
+        stations: Sequence[float] | None = None,
         start: int = 0,
         parameters: Any = None,
         estimator_settings: Any = None,
@@ -90,9 +90,9 @@ class RoadEstimator:
         Args:
             road: A road file, the name of a road, or a `Corridor`.
             estimator: See the keyword of an environment.
-            stations: Places of stations on the mainline [km], increasing. Where neither caller nor
-                road file give settings, `asm` smooths over half of their mean distance, over 0.1 to
-                1 km.
+            stations: Places of stations on the mainline [km], increasing; None for the loops of the
+                road. Where neither caller nor road file give settings, `asm` smooths over half of
+                their mean distance, over 0.1 to 1 km.
             start: The present second, on the clock of the stream.
             parameters: See the keyword of an environment.
             estimator_settings: See the keyword of an environment.
@@ -110,6 +110,8 @@ class RoadEstimator:
         self.corridor, self.model = config.corridor, make_model(config)
         self._borders = dict(_borders(self.corridor.geometry))
         settings = config.settings()
+        if stations is None:
+            stations = () if self.corridor.loops is None else self.corridor.loops.positions
         distance = self._distance(stations)
         if distance > 0.0 and config.estimator_settings is None and hasattr(settings, "asm"):
             own = dataclasses.replace(settings.asm, length=min(max(0.5 * distance, 0.1), 1.0))

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 import dptse_env
+from dptse_env import command_line
 
 GROUPS = {
     "try": {
@@ -125,4 +126,4 @@ def overview() -> str:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command_line.main()

@@ -148,6 +148,18 @@ def test_adaptive_smoothing_reaches_over_half_the_distance_of_stations():
         assert np.count_nonzero(bits(road)[1, :6] < bits(blind)[1, :6] - 0.5) == reached
 
 
+def test_the_loops_of_a_road_file_are_its_stations(tmp_path):
+    path = tmp_path / "road.toml"
+    text = ROAD_FILE.replace("[0, 0.1]", "[0, 0.3]").replace("n_mainline = 3", "n_mainline = 6")
+    own_settings = "estimator_settings = { asm = { length = 0.2 } }"
+    path.write_text(text.replace(own_settings, ""), encoding="utf-8")
+    given, found, none = (
+        RoadEstimator(str(path), "asm", **keywords).save()
+        for keywords in ({"stations": (0.0, 0.3)}, {}, {"stations": ()})
+    )
+    assert given == found != none
+
+
 def test_a_point_within_a_segment_is_said_to_count_at_its_border():
     with pytest.warns(UserWarning, match=r"^0\.26 km lies .* counts at its border at 0\.3 km$"):
         make().step(loops(0, borders=[0.26]), seconds=60)
@@ -485,6 +497,8 @@ KEYWORDS = [
     ({"stations": (0.5, 0.7)}, r"stations must be increasing places in 0\.\.0\.6 km, got"),
     ({"stations": (0.5, float("nan"))}, r"stations\[1\] must be a finite number, got nan"),
     ({"estimator": "no"}, r"estimator must be one of"),
+    ({"estimator": RoadEstimator}, r"estimator dptse_env\.\S+:RoadEstimator must be a subclass"),
+    ({"estimator": dict}, r"estimator builtins:dict must be a subclass"),
     ({"parameters": "no"}, r"parameters must be one of"),
     ({"estimator_settings": {"no": 1}}, r"estimator_settings\.no is unknown"),
 ]

@@ -16,6 +16,7 @@ from dptse_env.utils.validation import (
     inside,
     integer,
     non_negative,
+    number,
     require,
 )
 
@@ -105,6 +106,7 @@ def station(
         ValueError: A value is out of range, both or none of `count` and `flow` are given, or there
             is a count without a speed.
     """
+    km = number(float, km, "station.km", Interval(0, 1e4))
     seconds = integer("station.seconds", seconds, 1, LONGEST)
     allowed = "given where flow is not, and only there"
     require((count is None) != (flow is None), "station.count", allowed, count)
@@ -133,7 +135,7 @@ def probes(
     """Return what the mean speed of some vehicles on a part of the road says, of the speed alone.
 
     Args:
-        start: Where the part begins; see `Seen`.
+        start: Where the part begins [km]; see `Seen`.
         end: Where it ends.
         speed: Their mean speed [km/h].
         vehicles: Their number.

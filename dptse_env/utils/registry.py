@@ -98,7 +98,8 @@ class Registry(Mapping[str, Any]):
             part = self._parts.get(name, name)
             if isinstance(part, str):
                 part = self._imported(part)
-        if is_foreign(part):
+        is_shipped = isinstance(value, str) and value in self._shipped
+        if not (is_shipped or any(part is own for own in self._parts.values())):
             self._require(part)
         return part
 
