@@ -235,7 +235,11 @@ def _fit(config: EnvConfig, name: str) -> dict[str, Any]:
         "action": ACTION_ENCODINGS.name_of(config.action),
         "corridor": config.corridor.digest,
         "bandwidth": config.bandwidth,
+        "fixed_sensors": list(config.corridor.fixed_sensors),
     }
+    if (loops := config.corridor.loops) is not None:
+        places = {"positions": list(loops.positions), "ramps": list(loops.ramps)}
+        fit["loops"] = {**places, "interval": loops.interval, "least_count": loops.least_count}
     if not config.queries.are_segments:
         fit["queries"] = f"{config.queries}, bandwidth_unit {config.bandwidth_unit!r}"
     if name == SHARED:
@@ -263,7 +267,10 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
     else:
         pairs["observation"] = observations
         is_moved = road_there != road_here
-    if is_moved:
+    # Policies that ship do not name their fixed sensors, and were trained without loops.
+    fixed = here["fixed_sensors"]
+    sensors = there.get("fixed_sensors", fixed), there.get("loops")
+    if is_moved or sensors != (fixed, here.get("loops")):
         pairs["corridor"] = (
             f"{card['trained_on']}, traffic {road_there:.8}",
             f"{describe_road(config.corridor)}, traffic {road_here:.8}",

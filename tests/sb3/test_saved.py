@@ -207,6 +207,7 @@ def test_the_card_describes_the_policy(stored):
             {"privacy": "capped"},
             r"channels is \['mainline released_speed'\] for .*\['mainline released_flow'\]",
         ),
+        ({"corridor": {"fixed_sensors": [4, 7]}}, r"sensors on \[5, 7\]\), .* on \[4, 7\]\)"),
         ({"corridor": {"fixed_sensors": [7]}}, r"sensors on \[5, 7\]\), .* sensors on \[7\]\)"),
         (
             {"loops": {"positions": [0.2], "ramps": [4]}},
@@ -222,6 +223,17 @@ def test_the_card_describes_the_policy(stored):
 def test_a_policy_that_does_not_fit_is_refused(stored, keywords, message):
     with pytest.raises(ValueError, match=message):
         load_policy(stored, make_env(**keywords))
+
+
+def test_a_policy_that_was_trained_beside_other_loops_is_refused(path):
+    trained = {"positions": [0.2, 0.4], "interval": 20}
+    save_policy(path, *untrained(loops=trained), **ABOUT)
+    load_policy(path, make_env(loops=trained))
+    for other in ({"positions": [0.2, 0.5]}, {"interval": 240}, {"least_count": 5}):
+        env = make_env(loops=trained | other)
+        with pytest.raises(ValueError, match=r"corridor is .* loops at 0\.2, 0\.4 every"):
+            load_policy(path, env)
+        load_policy(path, env, allow=["corridor"])
 
 
 def test_a_shared_network_moves_on_purpose_to_another_road_and_bandwidth(path):
