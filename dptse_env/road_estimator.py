@@ -1,6 +1,7 @@
 """An estimator on a road, with whatever its sensors say: a door for a stream of one's own.
 
-A reading of an interval counts in every second of it. The estimator keeps some of its past states,
+A reading of a station counts in the middle of its interval, and what others say in every second of
+theirs. The estimator keeps some of its past states,
 and goes back to the interval's beginning and forward again, so that readings of a second or of ten
 minutes, in time or late, are one case. Sources of the same second and segment are put together by
 their variances. What nobody saw is as predicted.
@@ -21,7 +22,7 @@ from dptse_env.estimators import Estimate, Measurement, make_estimator
 from dptse_env.geometry import Geometry
 from dptse_env.measurement import nominal_state
 from dptse_env.measurement.boundary import nominal_inputs
-from dptse_env.measurement.loops import UNKNOWN, interpreted
+from dptse_env.measurement.loops import UNKNOWN, interpreted, seconds_told
 from dptse_env.measurement.seen import LONGEST, Seen
 from dptse_env.parts import make_model
 from dptse_env.traffic.loops import TOLERANCE
@@ -55,11 +56,15 @@ _NO_QUERIES = {
 class Entries(NamedTuple):
     """What sources of one interval add to K cells of the stream."""
 
-    before: int  # the second before the interval, or before what can still change
-    until: int
+    seconds: IntArray  # in which they count, and which can still change
     # (K,) segments, and boundary segments beside them where a source knows both quantities
     cells: IntArray
     added: FloatArray  # (K, 2, 2) weights 1 / std^2 and weighted values of both quantities
+
+
+def told_in(seconds: int, by_flow: bool) -> IntArray:
+    """Return the seconds of an interval, from 0 on, in which what a source says of it counts."""
+    return seconds_told(seconds) if by_flow else np.arange(seconds)
 
 
 class RoadEstimator:
@@ -153,7 +158,7 @@ class RoadEstimator:
         is_sequence = isinstance(seen, Iterable) and not isinstance(seen, str | bytes)
         require(is_sequence, "seen", "a sequence of what station() and others return", seen)
         entries = self._entries(list(seen), now)
-        changed = min([self.time, *(each.before for each in entries)])
+        changed = min([self.time, *(int(each.seconds[0]) - 1 for each in entries)])
         with self._whole(range(max(changed, now - N_ROWS) + 1, now + 1)):
             while now - self.time > LONGEST:
                 self._go_on(self.time + LONGEST, [])
@@ -244,7 +249,7 @@ class RoadEstimator:
 
     def _entries(self, seen: Sequence[Any], now: int) -> list[Entries]:
         """Return what sources add to the stream at second `now`, or refuse them."""
-        spans: dict[tuple[int, int], list[tuple[Seen, IntArray]]] = {}
+        spans: dict[tuple[int, int, bool], list[tuple[Seen, IntArray]]] = {}
         for i, each in enumerate(seen):
             path, allowed = f"seen[{i}]", "what station(), probes() or Seen() returns"
             require(isinstance(each, Seen), path, allowed, each)
@@ -252,11 +257,15 @@ class RoadEstimator:
             until = now if until is None else until
             allowed = f"in {oldest + 1}..{now}, which can still change"
             require(oldest < until <= now, f"{path}.until", allowed, until)
-            span = max(until - each.seconds, oldest), until
+            span = until, each.seconds, each.flow is not None
             spans.setdefault(span, []).append((each, self._segments(path, each)))
-        return [
-            Entries(*span, *self._added(*zip(*own, strict=True))) for span, own in spans.items()
-        ]
+        found = []
+        for (until, seconds, by_flow), own in spans.items():
+            told = until - seconds + 1 + told_in(seconds, by_flow)
+            told = told[told > max(now - LONGEST, self._start)]
+            if told.size:  # the middle of an interval may be before the beginning
+                found.append(Entries(told, *self._added(*zip(*own, strict=True))))
+        return found
 
     def _added(
         self, seen: Sequence[Seen], places: Sequence[IntArray]
@@ -280,9 +289,7 @@ class RoadEstimator:
         """
         road, seconds = self.corridor.road, told[:, 5]
         values, stds, flow = told[:, :2].T, told[:, 2:4].T, told[:, 4]
-        # An interval counts once, since errors of its seconds are alike. In what a flow says the
-        # number on a segment varies, too, which filters on the traffic model take for waves.
-        alike, by_flow = np.stack([seconds, seconds]), ~np.isnan(flow)
+        by_flow = ~np.isnan(flow)
         if by_flow.any():
             said = interpreted(
                 flow, values[1], seconds.astype(np.int64), road.lanes[segments],
@@ -290,9 +297,11 @@ class RoadEstimator:
             )  # fmt: skip
             values = np.where(by_flow, np.stack(said[:2]), values)
             stds = np.where(by_flow, np.stack(said[2:4]), stds)
-            if not self._estimator.steps_model:
-                alike[0] = np.where(by_flow, said.density_alike, seconds)
-        weights = np.nan_to_num(1.0 / (alike * stds**2))
+        # An interval counts once, since its errors are alike.
+        times = [
+            len(told_in(n, flows)) for n, flows in zip(seconds.astype(int), by_flow, strict=True)
+        ]
+        weights = np.nan_to_num(1.0 / (np.array(times) * stds**2))
         return np.stack([weights, weights * np.nan_to_num(values)], axis=-1).swapaxes(0, 1)
 
     def _segments(self, path: str, each: Seen) -> IntArray:
@@ -323,11 +332,11 @@ class RoadEstimator:
         """Go on to second `now`, from before what has changed."""
         self._stream[np.arange(self.time + 1, now + 1) % N_ROWS] = 0.0
         changed = self.time
-        for before, until, cells, added in entries:
+        for seconds, cells, added in entries:
             total = np.zeros(self._stream.shape[1:])
             np.add.at(total, cells, added)  # a cell may be there several times
-            self._stream[np.arange(before + 1, until + 1) % N_ROWS] += total
-            changed = min(changed, before)
+            self._stream[seconds % N_ROWS] += total
+            changed = min(changed, int(seconds[0]) - 1)
         back = max(second for second in self._kept if second <= changed)
         if back < self.time:
             self._restore(back)

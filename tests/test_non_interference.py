@@ -190,7 +190,7 @@ def test_what_is_released_of_traffics_does_differ():
 # --- beside loops ---------------------------------------------------------------------------------
 
 
-LOOPS = {"positions": [0.3], "interval": 7}
+LOOPS = {"positions": [0.3], "interval": 12}
 BESIDE_LOOPS = [
     ("paced", "ekf", "mask", "greedy-trace"), ("paced", "recurrent", "mask", "expected-reduction"),
     ("capped", "mhe", "sequential", None), ("paced", "enkf", "mask", "stale-variance"),
@@ -271,9 +271,9 @@ def test_a_reading_shows_when_its_interval_has_ended_and_not_before(preset, esti
 
     env = make_beside_loops(preset, trips, estimator=estimator)
     first, second = (transcript(env, seed, schedule) for seed in SEEDS)
-    # An episode begins in second 15; the interval in which traffic changes ends in second 35.
-    assert same(first[:20], second[:20])
-    assert not same(first[:21], second[:21])
+    # An episode begins in second 15; the interval in which traffic changes ends in second 36.
+    assert same(first[:21], second[:21])
+    assert not same(first[:22], second[:22])
 
 
 # --- what must be caught -------------------------------------------------------------------------

@@ -1,7 +1,8 @@
 """Loop detectors: what their readings say of the segments beside them.
 
 Readings are public before the releases and no part of any budget. A reading comes at the end of its
-interval and says something of every second of it: `dptse_env.measurement.replay`.
+interval and is told in the middle of it: `dptse_env.measurement.replay`. Were it told in every
+second, with errors that are alike, estimators would take its noise for what traffic did.
 """
 
 import math
@@ -26,33 +27,39 @@ STANDING = 75.0
 """Density of a lane that a jam has more than its flow tells, where nobody passes [veh/km]."""
 SLOWED = 0.2
 """Part of what vehicles in a jam are slower than flow and density tell."""
-NOTHING_PASSED = 45.0
-"""Deviation of a lane's density where nothing passed [veh/km]: it is empty, or stands."""
+QUEUE, LEAST_QUEUE, EMPTIED = 130.0, 0.02, 40.0
+"""Where nothing passed, a lane is empty, or stands with this density [veh/km]. Share of those that
+stand in long intervals, and what the rest of it falls with [s]."""
+QUEUES = 0.16, 0.02
+"""Share of lanes that stand in a moment without a vehicle, on the mainline and on ramps."""
 FLICKER, COUNTED = 0.6, 0.3
 """Parts of a Poisson process's variance that numbers on a segment have, and numbers that passed."""
 DENSITY_WAVES, SPEED_WAVES = 25.0, 16.0
 """Deviations in a jam, in a minute's readings: of a lane's density [veh/km], of speeds [km/h]."""
-RAMP_WAVES = 3.0
-"""Factor of their variances beside stations of ramps, where vehicles brake or speed up."""
+RAMP_SPEEDS, RAMP_SPREAD = 0.4, 0.3
+"""Speeds on a ramp are those at its mouth, where vehicles brake, over a + (1 - a) v / limit. Part
+of a density there that waves are, in intervals of up to 30 s."""
 DENSITY_FAR, SPEED_FAR = 3.0, 10.0
 """What deviations grow by with the length of a segment, far from jams [lane^-1 km^-2, h^-1]."""
+STRETCH = 10
+"""Seconds of an interval that a reading is told once in, at least [s]."""
 OWN_SPEED = 13.0
 """Deviation of a vehicle's speed [km/h]."""
 
 
 class Said(NamedTuple):
-    """What readings say of every second of their interval; NaN where nothing is said.
-
-    Errors of speeds are the same in all seconds, and those of densities but for what the number on
-    a segment varies by. Where the seconds count as independent ones, their variance is therefore
-    larger by the number of seconds that are alike.
-    """
+    """What readings say of any second of their interval; NaN where nothing is said."""
 
     density: FloatArray  # [veh/km]
     speed: FloatArray  # [km/h]
-    density_std: FloatArray  # of one second
+    density_std: FloatArray
     speed_std: FloatArray
-    density_alike: FloatArray  # seconds that are alike, from 1 to all
+
+
+def seconds_told(interval: int) -> IntArray:
+    """Return the seconds of an interval, from 0 on, in which an estimator is told its reading."""
+    n = max(interval // STRETCH, 1)
+    return ((np.arange(n) + 0.5) * interval / n).astype(np.int64)
 
 
 def interpreted(
@@ -69,15 +76,18 @@ def interpreted(
     In free traffic the density is q / v, with the flow q and the arithmetic mean speed v. In a jam
     vehicles that stand are not counted. There a lane whose density k = q / v is below k_v, that of
     vehicles at this speed, has more of it, by 75 (1 - k / k_v) J. J is the share of a jam, which
-    follows from v and the speed limit. The vehicles then are slower than v.
+    follows from v and the speed limit. The vehicles then are slower than v. Vehicles brake where a
+    ramp meets the road, so a ramp is faster than its station says, and less dense than q / v.
+
+    Where nothing passed, a lane is empty or stands; the longer the interval, the likelier it is
+    empty. The density is the mean of both.
 
     Variances are those of the number on a segment, of the number that passed, and of waves in a
     jam; of speeds those of the vehicles' own ones and of waves.
 
     Fitted to readings at all borders in training traffic, of the built-in roads (seeds 0 to 7) and
-    14 of the random highways that networks are trained on, in intervals of 20, 60 and 300 s. On
-    test seeds of the built-in roads, mean squared errors over variances by class of speed are .6 to
-    1.7, and .4 to 2 in intervals of 300 s (``tests/measurement/test_loops.py``).
+    14 of the random highways that networks are trained on, in intervals of 10 to 300 s. Mean
+    squared errors over variances by class of speed: ``tests/measurement/test_loops.py``.
 
     Args:
         flow: Of all lanes [veh/h]; NaN where there is no reading.
@@ -98,23 +108,29 @@ def interpreted(
         return share
 
     moving = 1000.0 / (SPACING + HEADWAY * v / KMH)
-    density = told + STANDING * np.maximum(1.0 - told / moving, 0.0) * jam(0.53)
+    braked = RAMP_SPEEDS + (1.0 - RAMP_SPEEDS) * np.minimum(v / limit, 1.0)
+    standing = STANDING * np.maximum(1.0 - told / moving, 0.0) * jam(0.53)
+    density = np.where(is_ramp, told * braked, told + standing)
     slower = SLOWED * v * (1.0 - told / np.maximum(density, 1e-9))
+    mean = np.where(is_ramp, np.minimum(v / braked, limit), v - slower)
     single = FLICKER * (density + 1.0) / lanes
     seen = v * interval / HOUR  # [km] that passes in an interval
-    waves = np.where(is_ramp, RAMP_WAVES, 1.0) * spread**2
-    density_waves = waves * (DENSITY_WAVES * jam(0.6)) ** 2 * (1.0 + length)
+    ramp_waves = RAMP_SPREAD * told * np.maximum(interval / 30.0, 1.0) ** 0.5
+    waves = np.where(is_ramp, ramp_waves, spread * DENSITY_WAVES * jam(0.6))
+    density_waves = waves**2 * (1.0 + length)
     common = single * COUNTED / seen + (DENSITY_FAR * length) ** 2 + density_waves
     own = OWN_SPEED**2 / (1.0 + density * lanes * length) + (SPEED_FAR * length) ** 2
-    common = np.where(passed, common, NOTHING_PASSED**2)
+    speed_waves = (spread * SPEED_WAVES * jam(0.85)) ** 2
+    queue = LEAST_QUEUE + np.where(is_ramp, QUEUES[1], QUEUES[0]) * np.exp(-interval / EMPTIED)
+    density = np.where(passed, density, QUEUE * queue)
+    common = np.where(passed, common, QUEUE**2 * queue * (1.0 - queue))
     each = np.where(passed, single / length, 0.0)
-    density = np.where(silent, np.nan, np.where(passed, lanes * density, 0.0))
+    density = np.where(silent, np.nan, lanes * density)
     return Said(
         density,
-        np.where(passed, v - slower, np.nan),
+        np.where(passed, mean, np.nan),
         lanes * np.sqrt(common + each) + 0.0 * density,
-        np.where(passed, np.sqrt(own + waves * (SPEED_WAVES * jam(0.85)) ** 2), np.nan),
-        (interval * common + each) / (common + each),
+        np.where(passed, np.sqrt(own + speed_waves), np.nan),
     )
 
 
@@ -138,6 +154,9 @@ class LoopReadings:
         least_density = 1.0 / road.lengths[segments]
         self._places = Bundle(Places(channels, segments, least_density, task.releases_flow))
         self._limit = road.limits[segments]
+        told = seconds_told(self.interval)
+        self._tells = np.isin(np.arange(self.interval), told)
+        self._n_told = len(told)
         # np.empty takes address space, not memory, until traffic is loaded.
         self._said = np.empty((*traffic.readings.shape[:2], segments.size, 4))
         self._loaded = np.zeros(len(traffic.seeds), dtype=bool)
@@ -186,16 +205,16 @@ class LoopReadings:
         return means
 
     def load(self, indices: IntArray) -> None:
-        """Make what is said in each second of all intervals, of traffic that is loaded, once."""
+        """Make what is said in all intervals, of traffic that is loaded, once."""
         for index in np.unique(indices[~self._loaded[indices]]).tolist():
             said = self.said(self._traffic.readings[index])
-            density_std = said.density_std * np.sqrt(said.density_alike)
-            speed_std = said.speed_std * self.interval**0.5
+            more = self._n_told**0.5  # the errors of an interval are alike
+            density_std, speed_std = more * said.density_std, more * said.speed_std
             self._said[index] = np.stack([said.density, said.speed, density_std, speed_std], -1)
             self._loaded[index] = True
 
     def said_until(self, traffic: IntArray, times: IntArray) -> FloatArray:
-        """Return what is said in each second of the intervals that end at seconds (k,).
+        """Return what is said of the intervals that end at seconds (k,), each time it is told.
 
         Returns:
             Density, speed and deviations of both, shape (k, L, 4); NaN where nothing is said.
@@ -203,16 +222,17 @@ class LoopReadings:
         found: FloatArray = self._said[traffic, times // self.interval - 1]
         return found
 
-    def added(self, measured: Measurement, said: FloatArray) -> Measurement:
-        """Return the measurement of some seconds with what readings say of each of them.
+    def added(self, measured: Measurement, said: FloatArray, seconds: IntArray) -> Measurement:
+        """Return the measurement of some seconds with what readings say, where they are told.
 
         Where a segment is measured in the same second, both are weighed by their variances.
 
         Args:
             measured: Of m seconds of k episodes, one after the other, m k rows.
             said: What `said_until` returns of the k episodes.
+            seconds: Seconds of the interval, from 0 on, shape (m,).
         """
-        observed, values, sigma = merge(self._places, measured, said)
+        observed, values, sigma = merge(self._places, measured, said, self._tells[seconds])
         return measured._replace(observed=observed, values=values, sigma=sigma)
 
 
@@ -227,13 +247,15 @@ class Places(NamedTuple):
 
 @kernel
 def merge(
-    bundle: Any, measured: Measurement, said: FloatArray
+    bundle: Any, measured: Measurement, said: FloatArray, tells: BoolArray
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Return the first fields of a `Measurement`, see `LoopReadings.added`."""
     (places,) = bundle.parts
     observed, values = measured.observed.copy(), measured.values.copy()
     sigma = measured.sigma.copy()
     for row in range(len(observed)):
+        if not tells[row // len(said)]:
+            continue
         for i in range(places.channel.size):
             density, speed, density_std, speed_std = said[row % len(said), i]
             if np.isnan(density):

@@ -1,8 +1,8 @@
 """Replay: an estimator lives through an interval again, with what is known at its end.
 
-A reading of an interval says something of every second of it. So the estimator's state is kept once
-an interval, and what it was given since: inputs, and the numbers of the channels that were
-observed. When the readings come, it goes back and takes them in each of these seconds.
+A reading of an interval belongs to its middle. So the estimator's state is kept once an interval,
+and what it was given since: inputs, and the numbers of the channels that were observed. When the
+readings come, it goes back and takes them in the seconds `seconds_told` of the interval.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Replay:
             seconds = np.arange(begin, min(begin + size, interval))
             inputs, observed, values, sigma, centre = recall(self._log, seconds, episodes)
             measured = Measurement(observed, values, sigma, centre)
-            given = self._loops.added(measured, said)
+            given = self._loops.added(measured, said, seconds)
             # Episodes that began within the interval join in later.
             for i, n in enumerate(np.searchsorted(first, seconds, "right").tolist()):
                 live = episodes[:n]

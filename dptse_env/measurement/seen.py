@@ -20,8 +20,8 @@ from dptse_env.utils.validation import (
     require,
 )
 
-LONGEST = 600
-"""Seconds of an interval at most."""
+SHORTEST, LONGEST = 10, 600
+"""Seconds of a station's interval at least, and of any at most."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,8 @@ class Seen:
             require(value is None, f"seen.{name}", "None where there is a flow", value)
         known = flow == 0.0 or self.speed is not None
         require(known, "seen.speed", "a number where vehicles passed", self.speed)
+        allowed = f">= {SHORTEST} where there is a flow"
+        require(self.seconds >= SHORTEST, "seen.seconds", allowed, self.seconds)
 
 
 def station(
@@ -98,7 +100,7 @@ def station(
         count: Vehicles that passed in its interval; None where `flow` is given.
         flow: The same as a flow [veh/h]; None where `count` is given.
         speed: Arithmetic mean of their speeds [km/h]; None or NaN where nobody passed.
-        seconds: Length of the interval [s].
+        seconds: Length of the interval [s], 10 to 600. Add up the counts of shorter ones.
         until: Last second of the interval; None for the present one.
         ramp: See `Seen`.
 
@@ -107,7 +109,7 @@ def station(
             is a count without a speed.
     """
     km = number(float, km, "station.km", Interval(0, 1e4))
-    seconds = integer("station.seconds", seconds, 1, LONGEST)
+    seconds = integer("station.seconds", seconds, SHORTEST, LONGEST)
     allowed = "given where flow is not, and only there"
     require((count is None) != (flow is None), "station.count", allowed, count)
     if count is None:

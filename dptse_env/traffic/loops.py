@@ -30,7 +30,8 @@ class Loops:
             a segment is moved to the nearest border. A station counts who enters the segment behind
             its border: those of an on-ramp there, too, and not who leaves by an off-ramp.
         ramps: faces of ramps with a station, which counts who passes between ramp and mainline.
-        interval: length of an interval [s].
+        interval: length of an interval [s]. Those of fewer than 10 s hold too few vehicles to tell
+            what the traffic is.
         least_count: number of vehicles below which an interval reports nothing. A vehicle that
             passes alone shows its speed.
 
@@ -40,7 +41,7 @@ class Loops:
 
     positions: tuple[Annotated[float, Interval(0, 10_000)], ...] = ()
     ramps: tuple[Face, ...] = ()
-    interval: Annotated[int, Interval(1, 600)] = 20
+    interval: Annotated[int, Interval(10, 600)] = 20
     least_count: Annotated[int, Interval(0, 1000)] = 0
 
     def __post_init__(self) -> None:

@@ -10,15 +10,16 @@ import pytest
 
 from dptse_env.config import resolve
 from dptse_env.estimators import ESTIMATORS, REFERENCES, Estimate, Estimator, Measurement
+from dptse_env.measurement.loops import seconds_told
 from dptse_env.process import QueryProcess
 from dptse_env.utils.threads import SMALLEST_BLOCK
 from tests.helpers import COUNTED, PAID, SHORT, assert_same, fast_and_slow, lock_step, make_batch
 
-T = 7
+T = 10
 LOOPS = {"positions": [0.0, 0.2, 0.6], "ramps": [2], "interval": T, "least_count": 1}
 SEEDS = (11, 12, 13, 14)
 ALL = np.arange(4)
-STARTS = {"traffic_seed": [0, 1, 2, 1], "start": [0, 10, 39, 41]}
+STARTS = {"traffic_seed": [0, 1, 2, 1], "start": [0, 13, 39, 41]}
 """Episodes that begin at an interval's beginning and within one, and in its last second."""
 
 
@@ -49,7 +50,7 @@ WAYS = [("ekf", PAID), ("recurrent", COUNTED), ("enkf", "printed"), ("mhe", PAID
     ("estimator", "privacy"),
     fast_and_slow([(e, p) for e in ESTIMATORS for p in ("printed", COUNTED, PAID)], WAYS),
 )
-def test_the_estimator_is_as_if_it_had_had_the_readings_in_every_second(estimator, privacy):
+def test_the_estimator_is_as_if_it_had_had_the_readings_in_time(estimator, privacy):
     """At each interval's end, bit for bit, but for what it says of the releases of this second."""
     process = begun(estimator=estimator, privacy=privacy)
     by_hand, given = copy.deepcopy(process.estimator), {e: [] for e in ALL.tolist()}
@@ -71,9 +72,10 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_every_second(estimato
             own = np.array([episode])
             loops = process.loops
             said = loops.said_until(process.traffic_index[own], process.time[own])
-            for inputs, measured in given[episode]:
+            n = len(given[episode])  # fewer than an interval where the episode began within
+            for second, (inputs, measured) in enumerate(given[episode], T - n):
                 by_hand.predict(own, inputs)
-                by_hand.update(own, loops.added(measured, said))
+                by_hand.update(own, loops.added(measured, said, np.array([second])))
             given[episode].clear()
             for name in ("innovations", "diverged", "fallback"):
                 getattr(by_hand, name)[own] = getattr(process.estimator, name)[own]
@@ -81,7 +83,7 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_every_second(estimato
             for mine, other in zip(by_hand.estimate(), process.estimate, strict=True):
                 np.testing.assert_array_equal(mine[own], other[own])
             n_ends += 1
-    assert n_ends == 4 + 4 + 4 + 5
+    assert n_ends == 3 + 3 + 3 + 3
 
 
 @pytest.mark.parametrize("privacy", ["printed", COUNTED])
@@ -94,7 +96,10 @@ def test_what_is_known_of_a_segment_in_a_second_is_weighed_by_its_variance(priva
         generator.uniform(20.0, 90.0, (shape[0], task.n_cells)),
     )  # fmt: skip
     said = loops.said_until(process.traffic_index, np.array([2, 5, 9, 20]) * T)
-    given = loops.added(measured, said)
+    given = loops.added(measured, said, np.array([5, 5]))
+    untold = loops.added(measured, said, np.array([4, 6]))
+    for own, other in zip(untold, measured, strict=True):
+        np.testing.assert_array_equal(own, other)
     beside = np.unique(loops.stations.beside)
     rest = np.setdiff1d(np.arange(task.n_channels), beside)
     for own, other in zip(given[:3], measured[:3], strict=True):
@@ -124,7 +129,8 @@ def test_readings_come_at_the_ends_of_intervals_alone():
         same = with_loops.estimate.density == without.estimate.density
         differs.append(~same.all(axis=1))
     first = np.argmax(differs, axis=0)
-    np.testing.assert_array_equal(first, T - 1 - np.array(STARTS["start"]) % T)
+    begun_at = np.array(STARTS["start"]) % T  # who begins later than T / 2 is not told of it
+    np.testing.assert_array_equal(first, T - 1 - begun_at + T * (begun_at > T // 2))
 
 
 # --- what rules and reports see -------------------------------------------------------------------
@@ -152,10 +158,10 @@ def test_a_filter_that_starts_over_in_a_replay_says_so():
     process = begun(privacy="printed")
     actions, added = sampled(process, T), process.loops.added
 
-    def spoilt(measured, said):
-        values = added(measured, said).values.copy()
-        values[0] = np.nan  # in the first second that is lived through again
-        return added(measured, said)._replace(values=values)
+    def spoilt(measured, said, seconds):
+        values = added(measured, said, seconds).values.copy()
+        values[5] = np.nan  # in the second that is told of
+        return added(measured, said, seconds)._replace(values=values)
 
     process.loops.added = spoilt
     for action in actions[:-1]:
@@ -215,8 +221,8 @@ def test_a_batch_is_so_many_single_episodes_bit_for_bit(estimator, action, priva
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_episodes_begin_again_within_intervals(mode):
-    """Of six seconds, where an interval has four, and with resets of some in between."""
-    loops = {**LOOPS, "interval": 4}
+    """Of six seconds, where an interval has ten, and with resets of some in between."""
+    loops = {**LOOPS, "interval": 10}
     lock_step({"loops": loops, "truth_in_info": True}, 20, autoreset_mode=mode)
 
 
@@ -250,7 +256,7 @@ def test_an_episode_may_pause_while_others_go_on():
 @pytest.mark.parametrize("estimator", ["ekf", "recurrent"])
 def test_threads_change_nothing(estimator):
     n = 3 * SMALLEST_BLOCK
-    given = {"estimator": estimator, "loops": {**LOOPS, "interval": 4}}
+    given = {"estimator": estimator, "loops": {**LOOPS, "interval": 10}}
     one, two = (make_batch(n, threads=threads, **given) for threads in (1, 2))
     assert_same(one.reset(seed=5), two.reset(seed=5))
     one.action_space.seed(1)
@@ -351,20 +357,21 @@ class Copying(Held):
 
 def test_an_estimator_of_another_package_goes_back_by_what_it_remembers():
     process = begun(estimator=Remembering, privacy="printed")
-    nothing, before = np.zeros((4, 6), dtype=np.int8), []
+    nothing = np.zeros((4, 6), dtype=np.int8)
     for _ in range(T - 1):
         process.step(ALL, nothing)
-        before.append(process.estimate.density[0].copy())
+    before = process.estimate.density[0].copy()
     process.step(ALL, nothing)
     fixed = list(process.config.corridor.fixed_sensors)
     beside = np.unique(process.loops.stations.beside)
     said = process.loops.said(process.loops.read(process.traffic_index[:1], np.array([0])))
     unseen = np.setdiff1d(np.arange(8), [*beside, *fixed])
-    np.testing.assert_allclose(process.estimate.density[0, unseen], before[-1][unseen] + 0.1)
+    np.testing.assert_allclose(process.estimate.density[0, unseen], before[unseen] + 0.1)
     known = np.isfinite(said.density[0]) & ~np.isin(beside, fixed)
     assert known.any()
     read = process.estimate.density[0, beside[known]]
-    np.testing.assert_array_equal(read, said.density[0, known])
+    since = 0.1 * (T - 1 - seconds_told(T)[-1])
+    np.testing.assert_allclose(read, said.density[0, known] + since)
 
 
 @pytest.mark.parametrize("make", [partial(gym.make, SHORT), make_batch])

@@ -36,7 +36,7 @@ READINGS = [
     ({"count": 1, "speed": NAN}, r"station\.speed must be a finite number >= 0, got nan"),
     ({"count": 1, "speed": -5}, r"station\.speed must be a finite number >= 0, got -5"),
     ({"count": 1, "speed": "80"}, r"station\.speed must be a finite number >= 0, got '80'"),
-    ({"count": 0, "seconds": 0}, r"station\.seconds must be an integer in 1\.\.600, got 0"),
+    ({"count": 0, "seconds": 0}, r"station\.seconds must be an integer in 10\.\.600, got 0"),
     ({"count": 0, "seconds": 601}, r"station\.seconds must be an integer .*, got 601"),
     ({"count": 0, "seconds": 20.5}, r"station\.seconds must be an integer .*, got 20\.5"),
     ({"count": 0, "km": -0.1}, r"station\.km must be a number in \[0, 10000\], got -0\.1"),

@@ -1,6 +1,6 @@
 """Readings of loop detectors: those of SUMO's own, and of vehicles that are hard to follow."""
 
-import dataclasses
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -125,7 +125,12 @@ N, ON_RAMP, OFF_RAMP, UPSTREAM, DOWNSTREAM, BEFORE, AFTER = 6, 6, 7, 8, 9, 10, 1
 """Mainline segments and cells of the short highway, whose ramps are at faces 2 and 4."""
 STATIONS = (0, 1, 2, 3, 4, 5, N, "on", "off")
 SHORT_ROAD = with_all_loops(SHORT_HIGHWAY, duration=40, incident=None)
-EACH_SECOND = SHORT_ROAD.replaced(loops=dataclasses.replace(SHORT_ROAD.loops, interval=1))
+
+
+def each(seconds, made):
+    """Readings of all stations of the short highway in shorter intervals than loops have."""
+    stations = Stations.of(SHORT_ROAD.loops, SHORT_ROAD.geometry)
+    return readings(made, stations, SimpleNamespace(interval=seconds, least_count=0))
 
 
 def driven(places, speeds=72.0):
@@ -165,7 +170,7 @@ def driven(places, speeds=72.0):
     ],
 )
 def test_who_passes_is_counted_once_in_the_second_that_ends_beyond(places, passed):
-    found = read(EACH_SECOND, driven(places))
+    found = each(1, driven(places))
     intervals, stations = np.nonzero(found[..., 0])
     seconds = (intervals + 1).tolist()
     assert set(zip(seconds, (STATIONS[f] for f in stations), strict=True)) == passed
@@ -173,13 +178,11 @@ def test_who_passes_is_counted_once_in_the_second_that_ends_beyond(places, passe
 
 
 def test_speeds_are_means_of_both_seconds_and_over_vehicles():
-    found = read(EACH_SECOND, driven({5: UPSTREAM, 6: 0, 8: 0}, (50.0, 60.0, 99.0)))
+    found = each(1, driven({5: UPSTREAM, 6: 0, 8: 0}, (50.0, 60.0, 99.0)))
     assert found[5, 0].tolist() == [1.0, 55.0]
     assert np.isnan(found[4, 0, 1])
     two = record([[8, 0, 0], [AWAY, 8, 0]], [[50.0, 60.0, 0.0], [0.0, 20.0, 30.0]])
-    loops = Loops((0.0,), interval=2)
-    stations = Stations.of(loops, SHORT_HIGHWAY.geometry)
-    assert readings(two, stations, loops).tolist() == [[[2.0, 40.0]]]
+    assert each(2, two)[0, 0].tolist() == [2.0, 40.0]
 
 
 def test_few_vehicles_are_told_of_nobody():
