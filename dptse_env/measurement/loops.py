@@ -85,9 +85,9 @@ def interpreted(
     Variances are those of the number on a segment, of the number that passed, and of waves in a
     jam; of speeds those of the vehicles' own ones and of waves.
 
-    Fitted to readings at all borders in training traffic, of the built-in roads (seeds 0 to 7) and
-    14 of the random highways that networks are trained on, in intervals of 10 to 300 s. Mean
-    squared errors over variances by class of speed: ``tests/measurement/test_loops.py``.
+    Fitted to readings at all borders in training traffic of the built-in roads (seeds 0 to 7), in
+    intervals of 10 to 300 s. Mean squared errors over variances by class of speed:
+    ``tests/measurement/test_loops.py``.
 
     Args:
         flow: Of all lanes [veh/h]; NaN where there is no reading.
