@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 
 import dptse_env
-from dptse_env import command_line
 
 GROUPS = {
     "try": {
@@ -126,4 +125,4 @@ def overview() -> str:
 
 
 if __name__ == "__main__":
-    command_line.main()
+    main(sys.argv[1:])

@@ -202,16 +202,9 @@ def test_ctrl_c_while_the_program_loads_is_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err.split() == ["interrupted", "before", "it", "began"]
 
 
-@pytest.mark.parametrize(
-    "begin",
-    [
-        "from dptse_env.command_line import main; main()",
-        "import runpy; runpy.run_module('scripts.dptse', run_name='__main__')",
-    ],
-)
 @pytest.mark.parametrize("words", [["--help"], ["info", "--help"]])
-def test_a_pipe_may_be_closed_as_by_head(begin, words):
-    program = f"import sys; sys.stdin.read(); {begin}"
+def test_a_pipe_may_be_closed_as_by_head(words):
+    program = "import sys; from dptse_env.command_line import main; sys.stdin.read(); main()"
     words = [sys.executable, "-c", program, *words]
     with subprocess.Popen(
         words, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
