@@ -416,7 +416,9 @@ def test_beside_loops_no_two_worlds_of_equal_readings_are_further_apart(number):
             return values[draw(len(values))]
 
         config = configuration(one_of)
-        loops = Loops((one_of(0.1, 0.3, 0.5),), interval=one_of(4, 7, 10), least_count=one_of(0, 3))
+        loops = Loops(
+            (one_of(0.1, 0.3, 0.5),), interval=one_of(10, 12, 15), least_count=one_of(0, 3)
+        )
         road, spans = config.corridor.replaced(loops=loops), {1, *config.query_spans}
         config = dataclasses.replace(config, corridor=road, query_spans=tuple(sorted(spans)))
         trips = alike_trips(config, generator)
