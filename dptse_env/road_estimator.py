@@ -54,7 +54,7 @@ _NO_QUERIES = {
 
 
 class Entries(NamedTuple):
-    """What sources of one interval add to K cells of the stream."""
+    """Additions of the sources of one interval to K cells of the stream."""
 
     seconds: IntArray  # in which they count, and which can still change
     # (K,) segments, and boundary segments beside them where a source knows both quantities

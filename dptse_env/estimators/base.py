@@ -270,7 +270,7 @@ class Estimator(ABC):
 
     @property
     def _memory(self) -> tuple[AnyArray, ...]:
-        """What `reset`, `predict` and `update` change and read, but for the base class's arrays."""
+        """Arrays that `reset`, `predict` and `update` change and read, without the base class's."""
         raise ValueError(
             f"estimator must have _memory to go back in time, got {name_of_class(type(self))}"
         )

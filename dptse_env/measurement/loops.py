@@ -28,8 +28,8 @@ STANDING = 75.0
 SLOWED = 0.2
 """Part of what vehicles in a jam are slower than flow and density tell."""
 QUEUE, LEAST_QUEUE, EMPTIED = 130.0, 0.02, 40.0
-"""Where nothing passed, a lane is empty, or stands with this density [veh/km]. Share of those that
-stand in long intervals, and what the rest of it falls with [s]."""
+"""Density of a lane that stands where nothing passed [veh/km]; the others are empty. Share of those
+that stand in long intervals, and the time in which the rest of it falls [s]."""
 QUEUES = 0.16, 0.02
 """Share of lanes that stand in a moment without a vehicle, on the mainline and on ramps."""
 FLICKER, COUNTED = 0.6, 0.3
@@ -40,7 +40,7 @@ RAMP_SPEEDS, RAMP_SPREAD = 0.4, 0.3
 """Speeds on a ramp are those at its mouth, where vehicles brake, over a + (1 - a) v / limit. Part
 of a density there that waves are, in intervals of up to 30 s."""
 DENSITY_FAR, SPEED_FAR = 3.0, 10.0
-"""What deviations grow by with the length of a segment, far from jams [lane^-1 km^-2, h^-1]."""
+"""Growth of deviations with the length of a segment, far from jams [lane^-1 km^-2, h^-1]."""
 STRETCH = 10
 """Seconds of an interval that a reading is told once in, at least [s]."""
 OWN_SPEED = 13.0
@@ -48,7 +48,7 @@ OWN_SPEED = 13.0
 
 
 class Said(NamedTuple):
-    """What readings say of any second of their interval; NaN where nothing is said."""
+    """Traffic in any second of an interval, by its readings; NaN where nothing is said."""
 
     density: FloatArray  # [veh/km]
     speed: FloatArray  # [km/h]

@@ -63,7 +63,7 @@ class Replay:
 
     @property
     def shared(self) -> tuple[Any, ...]:
-        """What no episode changes, so that copies share it."""
+        """Parts that no episode changes, so that copies share them."""
         return self._loops, self._threads
 
     def begin(self, episodes: IntArray, times: IntArray) -> None:
@@ -137,7 +137,7 @@ def _block_of(place: tuple[IntArray, IntArray], block: slice) -> tuple[IntArray,
 
 
 class Log(NamedTuple):
-    """What was given in the T seconds of the present interval of n episodes.
+    """Inputs and measurements of the T seconds of the present interval of n episodes.
 
     Slots have the channels that were observed, one after the other.
     """

@@ -1,4 +1,4 @@
-"""What sources other than releases say of a road: stations of loops, probes, or any other.
+"""Statements of sources other than releases: stations of loops, probes, or any other.
 
 `dptse_env.RoadEstimator` takes them.
 """
@@ -26,7 +26,7 @@ SHORTEST, LONGEST = 10, 600
 
 @dataclass(frozen=True)
 class Seen:
-    """What a source says of a part of the road on average over some seconds.
+    """Statement of a source on a part of the road, an average over some seconds.
 
     Attributes:
         start: Where it begins [km], from the upstream end of the mainline, or of its ramp.

@@ -51,7 +51,7 @@ def test_processes_that_share_loaded_traffic_read_the_same():
 
 
 def told(count, speed, interval=20, lanes=3.0, length=0.1, limit=102.0, **keywords):
-    """What a station says that counted some vehicles of a mean speed."""
+    """Statement of a station that counted some vehicles of a mean speed."""
     flow = np.asarray(count, dtype=float) * 3600.0 / interval
     speeds = np.broadcast_to(np.asarray(speed, dtype=float), flow.shape)
     return interpreted(flow, speeds, interval, lanes, length, limit, **keywords)
