@@ -122,9 +122,6 @@ def test_tuned_settings_are_found_by_estimator_parameters_privacy_and_road():
     assert long.settings_name == "ekf-w99-3lane-paced-long-highway"
     assert resolve("long-highway", {"estimator": "mhe"}).settings_name == "mhe-w99-3lane-paced"
     assert resolve("private-highway", {}).settings_name == "ekf-w99-3lane-paced"
-    # `ekf-w99-3lane-capped-demand` is a variant, not a set for a road that is called demand.
-    keywords = {"parameters": "w99-3lane", "privacy": "capped", "corridor": {"name": "demand"}}
-    assert resolve("paper-highway", keywords).settings_name == "ekf-w99-3lane-capped"
 
 
 def test_a_tuned_set_by_name_serves_any_estimator():

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.estimators import ESTIMATORS, EstimatorSettings
-from dptse_env.estimators.ekf import count_variance
+from dptse_env.estimators import ESTIMATORS
 from dptse_env.estimators.tuned import load_settings, write_settings
-from dptse_env.model import ARZModel, load_parameters
+from dptse_env.model import load_parameters
 from dptse_env.model.parameters import write_parameters
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.traffic import write_corridor
@@ -61,20 +60,12 @@ def test_every_estimator_and_release_model_runs_on_an_uneven_road(road_file, key
 def test_both_backends_agree_on_an_uneven_road(road_file, estimator):
     rewards = []
     for backend in ("compiled", "reference"):
-        settings = {"count_noise": 2.0}
+        settings = {"flicker": True, "vehicle_noise": [0.04, 0.02]}
         # Prices that follow predictions would magnify what rounding makes of them.
         keywords = {"privacy": "capped", "estimator_settings": settings}
         env = make(road_file, estimator=estimator, backend=backend, **keywords)
         rewards.append([reward for _, reward, *_ in play(env, 40)[1:]])
     np.testing.assert_allclose(*rewards, rtol=1e-4)
-
-
-def test_a_count_scatters_less_in_density_on_a_longer_segment():
-    model = ARZModel(ROAD.road, load_parameters("w99-3lane"))
-    variance = count_variance(model, EstimatorSettings(count_noise=2.0))
-    np.testing.assert_allclose(
-        variance * ROAD.geometry.segment_lengths, 2.0 / model.density_scale**2, rtol=1e-12
-    )
 
 
 def test_weights_on_a_road_unlike_those_of_their_training_are_named(road_file):
@@ -171,10 +162,10 @@ def test_a_set_of_ones_own_with_the_name_of_a_shipped_one_is_no_shipped_one():
 
 @pytest.mark.filterwarnings("error")
 def test_parameters_of_ones_own_warn_of_nothing_where_settings_are_given_or_none_ship():
-    given = gym.make(ID, parameters=MINE, estimator_settings={"count_noise": 0.5})
+    given = gym.make(ID, parameters=MINE, estimator_settings={"initial_variance": 0.5})
     gym.make(ID, parameters=MINE, estimator="open_loop")
     tuned = load_settings("ekf-w99-3lane-paced")
-    assert given.unwrapped.config.settings() == dataclasses.replace(tuned, count_noise=0.5)
+    assert given.unwrapped.config.settings() == dataclasses.replace(tuned, initial_variance=0.5)
     with pytest.raises(
         ValueError, match="derived_from must be one of published, w99-3lane, got 'x'"
     ):
@@ -186,7 +177,7 @@ def test_files_of_a_road_hold_for_the_estimator_that_they_were_tuned_for(tmp_pat
     write_parameters(tmp_path / "arz.json", arz, {})
     write_settings(
         tmp_path / "ekf.json", estimator="ekf", parameters="mine", privacy="paced",
-        settings={"demand": {}, "count_noise": 0.1}, provenance={},
+        settings={"demand": {}, "initial_variance": 0.1}, provenance={},
     )  # fmt: skip
     road = str(tmp_path / "tuned.toml")
     table = {"estimator_settings": "ekf.json", "parameters": "arz.json", "bandwidth": 2}
@@ -200,7 +191,7 @@ def test_files_of_a_road_hold_for_the_estimator_that_they_were_tuned_for(tmp_pat
         whole = config()
     assert whole.inherited == ()
     assert whole.parameters == arz
-    assert (whole.settings().count_noise, whole.settings().demand is None) == (0.1, False)
+    assert (whole.settings().initial_variance, whole.settings().demand is None) == (0.1, False)
     with pytest.warns(UserWarning, match="^estimator_settings: values measured or tuned on"):
         assert config(estimator="random_walk").settings_name == "random_walk-w99-3lane-paced"
     assert config(estimator="open_loop").settings().demand is None

@@ -62,7 +62,17 @@ SPACE: dict[str, dict[str, Knob]] = {
 }
 """By estimator."""
 
-Extra = Literal["noise-scale", "demand", "speed-cap"]
+# Noise of vehicles and flicker explain what constant noise stands for otherwise, so that its best
+# values are smaller.
+_VEHICLES: dict[str, Knob] = {
+    "process_noise.0": evenly(1e-4, 5e-2),
+    "process_noise.1": evenly(1e-5, 5e-2),
+    "vehicle_noise.0": evenly(1e-2, 0.1),
+    "vehicle_noise.1": evenly(4e-3, 0.1),
+    "flicker": CategoricalDistribution((True,)),
+}
+
+Extra = Literal["noise-scale", "vehicles", "demand", "speed-cap"]
 
 EXTRAS: dict[Extra, dict[str, Knob]] = {
     # Q and R times one factor leave the estimates of all but the UKF as they are, and there alpha
@@ -72,13 +82,9 @@ EXTRAS: dict[Extra, dict[str, Knob]] = {
         "noise_scale.0": CategoricalDistribution((1.0,)),
         "noise_scale.1": evenly(0.5, 5.0),
     },
-    # Demand states explain what constant process noise stands for otherwise, so that its best
-    # values are smaller.
+    "vehicles": _VEHICLES,
     "demand": {
-        "process_noise.0": evenly(1e-4, 5e-2),
-        "process_noise.1": evenly(1e-5, 5e-2),
-        "density_growth": evenly(1e-4, 0.1),
-        "count_noise": evenly(3e-3, 3.0),
+        **_VEHICLES,
         "demand.deviation": evenly(0.02, 0.6),
         "demand.walk": evenly(1e-3, 0.3),
     },
@@ -87,9 +93,9 @@ EXTRAS: dict[Extra, dict[str, Knob]] = {
 """Settings of every estimator that are searched where that is asked for."""
 
 DEMAND_START = EstimatorSettings(
-    process_noise=(0.0061, 0.001),
-    density_growth=0.0115,
-    count_noise=0.09,
+    process_noise=(5e-4, 5e-4),
+    vehicle_noise=(0.035, 0.02),
+    flicker=True,
     noise_scale=(1.0, 1.2),
     demand=DemandSettings(),
 )
@@ -104,12 +110,13 @@ def search_space(estimator: str, extras: Collection[Extra] = ()) -> dict[str, Kn
         extras: Names in `EXTRAS`.
 
     Raises:
-        ValueError: The estimator has nothing to tune, or no demand states.
+        ValueError: The estimator has nothing to tune, or no traffic model.
     """
     require_name("estimators", estimator, SPACE)
-    if "demand" in extras and estimator in ("random_walk", "asm"):
+    of_model = [extra for extra in ("vehicles", "demand") if extra in extras]
+    if of_model and estimator in ("random_walk", "asm"):
         raise ValueError(
-            f"also must leave out demand for {estimator!r}, which has no traffic model"
+            f"also must leave out {of_model[0]} for {estimator!r}, which has no traffic model"
         )
     asked = (knobs for name, knobs in EXTRAS.items() if name in extras)
     return reduce(dict.__or__, asked, SPACE[estimator])

@@ -52,9 +52,8 @@ class Filters(NamedTuple):
     units: FloatArray  # (n_x,) of normalised components [veh/km, veh/h, 1]
     initial_variance: FloatArray  # (n_x,) normalised
     process_variance: FloatArray  # (n_x,) normalised, of a step
-    growth_variance: float  # variance that rho / rho_m = 1 adds to the process noise of rho
-    vehicle_variance: FloatArray  # (2,) that it adds by vehicles with the others' w, and to psi
-    count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
+    # (2,) variances at rho_m of vehicles with the others' w, and of psi beside that
+    vehicle_variance: FloatArray
     is_box: bool  # whether means are projected into the paper's box, not the cone
 
 
@@ -79,9 +78,7 @@ class CovarianceFilter(KernelEstimator):
             units=model.state_scale,
             initial_variance=initial_variance(model, settings),
             process_variance=process_variance(model, settings),
-            growth_variance=float(settings.density_growth) ** 2,
             vehicle_variance=np.square(settings.vehicle_noise),
-            count_variance=count_variance(model, settings),
             is_box=settings.bounds == "box",
         )
         self.arrays = self._moments = Bundle(*model.dynamics, self.filters)
@@ -174,7 +171,6 @@ def process_noise(
     of_vehicles, of_psi = filters.vehicle_variance[0], filters.vehicle_variance[1]
     for s in range(road.n_segments):
         i, j = 2 * s, 2 * s + 1
-        variance[i] += filters.growth_variance * mean[i] / filters.units[i]
         slopes[s], rho = 0.0, mean[i] / filters.units[i]
         if (of_vehicles > 0.0 or of_psi > 0.0) and rho > 0.0:
             # The sum of [[c, 0], [0, d]], of a rho [[1, w], [w, w^2]] and of [[0, 0], [0, b rho]].
@@ -238,7 +234,6 @@ def _linearise(
         residuals[0] = values[m, 0] / units[0] - density
         residuals[1] = values[m, 1] / arz.second_scale - residuals[1]
         linear.noise[m, 0] = (sigma[m, 0] / units[0]) ** 2
-        linear.noise[m, 0] += filters.count_variance[m] * density * units[0] / span
         linear.noise[m, 1] = (sigma[m, 1] / arz.second_scale) ** 2
 
 
@@ -367,13 +362,3 @@ def initial_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray
     traffic = np.full(2 * model.n_segments, settings.initial_variance)
     deviation = 0.0 if settings.demand is None else settings.demand.deviation
     return np.concatenate([traffic, np.full(model.n_demand_states, deviation**2)])
-
-
-def count_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
-    """Return the variances of measured densities beside the noise, over rho [km/veh], shape (M,).
-
-    They are those of a channel's first segment; one of several segments has so many times less.
-    """
-    lengths = model.road.lengths[model.channels.first]
-    variance: FloatArray = settings.count_noise / lengths / model.density_scale**2
-    return variance

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from dptse_env.estimators.base import Estimate, KernelEstimator, Measurement
 from dptse_env.estimators.ekf import (
-    count_variance,
     find_observed,
     initial_variance,
     process_variance,
@@ -50,9 +49,8 @@ class Ensembles(NamedTuple):
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
     process_deviation: FloatArray  # (n_x,) of a step [veh/km, veh/h, 1]
-    density_growth: float  # deviation over rho_m that rho = rho_m adds to the noise of rho
-    vehicle_noise: FloatArray  # (2,) by vehicles with the others' w, and of psi over rho_m v_f
-    count_variance: FloatArray  # (M,) variance of densities beside the noise, over rho, normalised
+    # (2,) deviations at rho_m of vehicles with the others' w, and of psi beside that
+    vehicle_noise: FloatArray
     initial_deviation: FloatArray  # (n_x,) of the members around a prior [veh/km, veh/h, 1]
     density_scale: float  # rho_m [veh/km]
     inflation: float  # factor on distances from the mean before an update
@@ -183,10 +181,6 @@ def _process_deviation(
     for s in range(road.n_segments):
         i, j = 2 * s, 2 * s + 1
         slopes[s] = 0.0
-        if ensembles.density_growth > 0.0:
-            share = mean_of(members[i], n) / scale
-            grown = (ensembles.density_growth * scale) ** 2 * share
-            deviation[i] = np.sqrt(deviation[i] ** 2 + grown)
         rho = mean_of(members[i], n)
         if (noise[0] > 0.0 or noise[1] > 0.0) and rho > 0.0:  # as for the EKF, `process_noise`
             w = min(mean_of(members[j], n) / rho, LARGEST_W * arz.free_flow_speed)
@@ -303,9 +297,6 @@ def _compare(
         distance, residual, drawn = distances[r], residuals[r], draws[r * n : (r + 1) * n]
         mean = _centre(outputs[kind], n, units[kind], distance)
         size = sigma[m, kind] / units[kind]
-        if kind == 0 and ensembles.count_variance[m] > 0.0:
-            counted = ensembles.count_variance[m] * mean * units[0] / channels.span[m]
-            size = np.sqrt(size**2 + counted)
         difference = values[m, kind] / units[kind] - mean
         for j in range(n):  # z + noise - y (Burgers et al., 1998)
             residual[j] = difference + size * drawn[j] - distance[j]
@@ -396,8 +387,8 @@ class EnKF(KernelEstimator):
     covariances by distance, those of outputs with states and those among outputs. An S with
     covariances that the gain neglects would give the measurements too little weight.
 
-    The noise that depends on the density (`EstimatorSettings.density_growth` and `count_noise`)
-    has the variance at the ensemble's mean for all members.
+    The noise that depends on the density, that of vehicles and flicker, has the variance at the
+    ensemble's mean for all members.
     """
 
     predict_kernel = staticmethod(predict)
@@ -419,9 +410,7 @@ class EnKF(KernelEstimator):
             innovations=self.innovations,
             diverged=self.diverged,
             process_deviation=np.sqrt(process_variance(model, settings)) * model.state_scale,
-            density_growth=float(settings.density_growth),
             vehicle_noise=np.array(settings.vehicle_noise),
-            count_variance=count_variance(model, settings),
             initial_deviation=np.sqrt(initial_variance(model, settings)) * model.state_scale,
             density_scale=model.density_scale,
             inflation=settings.enkf.inflation,

@@ -268,7 +268,6 @@ def _measure(bundle: Bundle, e: int, measured: Measurement, k: int) -> bool:
     for i in range(mean.size):
         sound = sound and math.isfinite(mean[i])
     for m in range(channels.first.size):
-        first, span, density = channels.first[m], channels.span[m], 0.0
         for q in range(2):
             unit = filters.units[0] if q == 0 else arz.second_scale
             value = values[m, q] / unit if windows.observed[e, last, m] else 0.0
@@ -276,9 +275,6 @@ def _measure(bundle: Bundle, e: int, measured: Measurement, k: int) -> bool:
             deviation = max(sigma[m, q], LEAST_DEVIATION * unit) / unit
             windows.noise[e, last, m, q] = deviation**2
             sound = sound and math.isfinite(value)
-        for s in range(first, first + span):
-            density += mean[2 * s]
-        windows.noise[e, last, m, 0] += filters.count_variance[m] * density / span**2
     if windows.along:
         for t in range(last + 1):
             _linearise_channels(road, arz, channels, windows, e, t, windows.solution[e, t])

@@ -18,7 +18,7 @@ from scipy.linalg import LinAlgError, LinAlgWarning
 from scipy.sparse.linalg import splu
 
 from dptse_env.estimators.base import Estimate, Estimator, Measurement, estimated_traffic
-from dptse_env.estimators.ekf import count_variance, initial_variance, process_variance
+from dptse_env.estimators.ekf import initial_variance, process_variance
 from dptse_env.estimators.enkf import make_tapers
 from dptse_env.estimators.flicker import Flicker
 from dptse_env.estimators.mhe import (
@@ -67,7 +67,6 @@ class Problem:
         self.n_states = model.n_states
         self.prior_variance = initial_variance(model, settings)
         self._process_variance = process_variance(model, settings)
-        self._count_variance = count_variance(model, settings)
 
     def project(self, x: FloatArray, bounds: Bounds | None = None) -> FloatArray:
         """Return the states within bounds, by default the filter's."""
@@ -93,7 +92,6 @@ class Problem:
         covariance = np.diag(self._process_variance)
         for s in range(len(rho)):
             i, j = 2 * s, 2 * s + 1
-            covariance[i, i] += self.settings.density_growth**2 * rho[s]
             direction = np.array([1.0, w[s]])
             covariance[i : j + 1, i : j + 1] += (
                 of_vehicles * rho[s] * np.outer(direction, direction)
@@ -116,15 +114,9 @@ class Problem:
         matrix = matrix[seen.observed] * self.unit / self.release_unit[:, None]
         return np.asarray(matrix.reshape(-1, self.n_states))
 
-    def R(self, x: FloatArray, seen: Measurement, least: float = 0.0) -> FloatArray:  # noqa: N802
-        """Return the variances `(2 m,)` of the noise of a measurement at a mean.
-
-        Deviations are at least `least`, but for what counts add to them.
-        """
+    def R(self, seen: Measurement, least: float = 0.0) -> FloatArray:  # noqa: N802
+        """Return the variances `(2 m,)` of the noise of a measurement, deviations >= `least`."""
         variance = np.maximum(seen.sigma / self.release_unit, least) ** 2
-        variance[:, 0] += self._count_variance * (
-            self.model.averaging @ self._density(x) / self.model.channels.span
-        )
         return np.asarray(variance[seen.observed].ravel())
 
     def _density(self, x: FloatArray) -> FloatArray:
@@ -274,7 +266,7 @@ class _ExtendedFilter(EpisodeFilter, ExtendedKalmanFilter):  # type: ignore[misc
     def assimilate(self, seen: Measurement) -> FloatArray:
         if not seen.observed.any():
             return np.zeros(0)
-        problem, noise = self.problem, np.diag(self.problem.R(self.x, seen))
+        problem, noise = self.problem, np.diag(self.problem.R(seen))
         self.update(
             problem.z(seen),
             lambda x: problem.H(x, seen),
@@ -337,7 +329,7 @@ class _UnscentedFilter(EpisodeFilter, UnscentedKalmanFilter):  # type: ignore[mi
     def assimilate(self, seen: Measurement) -> FloatArray:
         if not seen.observed.any():
             return np.zeros(0)
-        noise = np.diag(self.problem.R(self.x, seen))
+        noise = np.diag(self.problem.R(seen))
         if not self.has_points:
             self._draw(None)
         outputs = iter(self.problem.h(self.sigmas_f, seen))
@@ -394,7 +386,7 @@ class _Ensemble(EpisodeFilter):
         mean = self.x
         members = problem.project(mean + self.enkf.inflation * (self.members - mean))
         outputs, z = problem.h(members, seen), problem.z(seen)
-        R = problem.R(members.mean(axis=0), seen)
+        R = problem.R(seen)
         X, D = members - members.mean(axis=0), outputs - outputs.mean(axis=0)
         with_states, among_channels = self.tapers
         cross = with_states[row].T * (X.T @ D) / (len(members) - 1)
@@ -487,7 +479,7 @@ class _Window(EpisodeFilter):
         observed, values, sigma, centre = seen
         stage.seen = Measurement(observed.copy(), values.copy(), sigma.copy(), centre.copy())
         self.has_failed = False
-        stage.R = self.problem.R(self.x, seen, LEAST_DEVIATION)
+        stage.R = self.problem.R(seen, LEAST_DEVIATION)
         if self.mhe.linearisation == "published":
             self._linearise_measurement(stage, stage.point)
         else:

@@ -197,15 +197,11 @@ class EstimatorSettings(_Checked, path=PATH):
     Attributes:
         process_noise: Standard deviations of the process noise of one step: of rho over rho_m, of
             psi over rho_m v_f.
-        density_growth: Standard deviation, over rho_m, of a further process noise of rho at jam
-            density; its variance is in proportion to rho.
         vehicle_noise: Standard deviations, over rho_m and rho_m v_f, of a further process noise at
             jam density, whose variances are in proportion to rho: of vehicles that the model does
             not foresee, whose w is that of the others, and of psi beside that.
         flicker: Whether measurements also have the deviation of counts from the densities of a
             continuum, `dptse_env.estimators.flicker`; only filters on the model read it.
-        count_noise: Variance of a measured density beside the mechanism's noise, as a share of
-            rho / l, the variance of a Poisson count: the model's densities are no counts.
         demand: Settings of demand states; None for a filter that takes the demands as given.
         walk_noise: Standard deviations of a step of the random walk: of rho over rho_m, of v over
             v_f.
@@ -229,10 +225,8 @@ class EstimatorSettings(_Checked, path=PATH):
     """
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
-    density_growth: Deviation = 0.0
     vehicle_noise: tuple[Deviation, Deviation] = (0.0, 0.0)
     flicker: bool = False
-    count_noise: Annotated[float, Interval(0, 100)] = 0.0
     demand: DemandSettings | None = None
     walk_noise: tuple[Deviation, Deviation] = (0.025, 0.025)
     speed_cap: Annotated[float, Interval(0, 10, open_low=True)] | None = None

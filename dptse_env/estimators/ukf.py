@@ -249,10 +249,6 @@ def _measure(
             shift[i] = _distances_from_first(number, units[q], points.weight, number)
             cross[i, residual] = (values[m, q] - first) / units[q] - shift[i]
             noise[i] = (sigma[m, q] / units[q]) ** 2
-        counted = 0.0
-        for s in range(channels.first[m], channels.first[m] + channels.span[m]):
-            counted += filters.means[e, 2 * s]
-        noise[2 * r] += filters.count_variance[m] * counted / channels.span[m] ** 2
     return noise
 
 

@@ -53,6 +53,7 @@ def test_the_search_holds_the_defaults_and_the_shipped_sets(estimator):
     starts = [DEMAND_START] if estimator not in ("random_walk", "asm") else []
     for settings in (EstimatorSettings(), *map(load_settings, names), *starts):
         extras = ("noise-scale", "demand") if settings.demand else ()
+        extras = extras or (("vehicles",) if settings.flicker else ())
         space = search_space(estimator, (*extras, "speed-cap"))
         assert set(space) >= set(EXTRAS["speed-cap"]) | set(SPACE[estimator])
         values = values_of(settings, space)

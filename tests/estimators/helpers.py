@@ -35,10 +35,7 @@ REFERENCE_SPEED = 51.0
 # The noise of a flow is v_0 times the density's where both get the same share of the privacy.
 SPEEDS, FLOWS = np.array([15.0, 6.0]), np.array([15.0, 15.0 * REFERENCE_SPEED])
 PLAIN = EstimatorSettings()
-RICH = EstimatorSettings(
-    density_growth=0.03, vehicle_noise=(0.04, 0.02), count_noise=0.5, flicker=True,
-    demand=DemandSettings(),
-)  # fmt: skip
+RICH = EstimatorSettings(vehicle_noise=(0.04, 0.02), flicker=True, demand=DemandSettings())
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,7 @@ def test_the_ekfs_agree_over_a_recorded_episode_and_beat_walk_and_model(release)
 
 SEEN = {"a pair": [(4, 2)], "what overlaps": [(4, 2), (5, 3), (5, 1), (16, 1)]}
 # So little uncertainty that the model is linear within it.
-SMALL, STEP_NOISE, GROWTH, COUNT_NOISE = 1e-5, (2e-5, 1e-5), 5e-5, 1e-7
+SMALL, STEP_NOISE, VEHICLE_NOISE = 1e-5, (2e-5, 1e-5), (5e-5, 3e-5)
 FACTOR, WALK = 1e-3, 1e-5  # deviations of demand factors
 
 
@@ -145,12 +145,14 @@ def derivative(function, x, scale):
 def textbook(model, name, x, inputs, values, sigma, centre, rows):
     """Mean, covariance and innovations of a step, normalised; the UKF's gain leaves Q out."""
     scale, v_f, S = model.state_scale, model.speed_scale, model.n_segments
-    rho_m, unit = model.density_scale, model.density_scale * np.array([1.0, v_f])
+    unit = model.density_scale * np.array([1.0, v_f])
     n_factors = model.n_states - 2 * S
     variance = np.square([SMALL] * 2 * S + [FACTOR] * n_factors)
-    noise = np.tile(np.square(STEP_NOISE), S)
-    noise[0::2] += GROWTH**2 * x[0 : 2 * S : 2] / rho_m
-    noise = np.concatenate([noise, np.full(n_factors, WALK**2)])
+    noise = np.diag([*np.tile(np.square(STEP_NOISE), S), *np.full(n_factors, WALK**2)])
+    of_vehicles, of_psi = np.square(VEHICLE_NOISE)
+    for s, (rho, psi) in enumerate(x[: 2 * S].reshape(S, 2) / unit):
+        block = of_vehicles * np.outer([rho, psi], [rho, psi]) / rho + np.diag([0.0, of_psi * rho])
+        noise[2 * s : 2 * s + 2, 2 * s : 2 * s + 2] += block
 
     def move(x):
         return model.step(x[None], inputs[None])[0] / scale
@@ -166,13 +168,10 @@ def textbook(model, name, x, inputs, values, sigma, centre, rows):
 
     F = derivative(move, x, scale)
     mean, of_points = move(x), F @ np.diag(variance) @ F.T
-    covariance = of_points + np.diag(noise)
+    covariance = of_points + noise
     known = covariance if name == "ekf" else of_points
     H = derivative(look, mean * scale, scale)
     R = np.square(sigma / unit)
-    for i, (first, span) in enumerate(rows):
-        density = (mean * scale)[0 : 2 * S : 2][first : first + span].mean()
-        R[i, 0] += COUNT_NOISE * density / model.road.lengths[0] / span / rho_m**2
     spread = H @ known @ H.T + np.diag(R.ravel())
     residual = (values / unit).ravel() - look(mean * scale)
     gain = known @ H.T @ np.linalg.inv(spread)
@@ -188,8 +187,7 @@ def test_an_update_is_that_of_a_kalman_filter(name, backend, seen):
     episodes = simulate(n_steps=1, release="rows")
     settings = EstimatorSettings(
         process_noise=STEP_NOISE,
-        density_growth=GROWTH,
-        count_noise=COUNT_NOISE,
+        vehicle_noise=VEHICLE_NOISE,
         initial_variance=SMALL**2,
         demand=DemandSettings(deviation=FACTOR, walk=WALK),
     )

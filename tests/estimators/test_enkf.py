@@ -18,10 +18,7 @@ from tests.model.oracle import W99
 from .helpers import RELEASES, RICH, run, simulate, started, step, update
 
 OPTIONS = {
-    "rich": {
-        name: getattr(RICH, name)
-        for name in ("demand", "density_growth", "vehicle_noise", "count_noise", "flicker")
-    },
+    "rich": {name: getattr(RICH, name) for name in ("demand", "vehicle_noise", "flicker")},
     "taper": {"enkf": EnsembleSettings(inflation=1.02, taper=0.35, n_members=31)},
     "inflation": {"enkf": EnsembleSettings(inflation=1.1)},
     "plain": {},

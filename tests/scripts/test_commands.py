@@ -294,7 +294,7 @@ def with_keyword(keyword):
     return ["--env", f'{SHORT} {{{{"{keyword}": "{{path}}"}}}}']
 
 
-SETTINGS = b'{"x": {"estimator": "ekf", "settings": {"count_noise": 1}, "provenance": {}}}'
+SETTINGS = b'{"x": {"estimator": "ekf", "settings": {"initial_variance": 1}, "provenance": {}}}'
 FIELD = ["--cell", "0.1", "--interval", "5", "--segments", "6"]
 FIELD_ROAD = ["--lanes", "2", "--speed-limit", "100"]
 NETWORK = b"<configuration><input><net-file value='n.net.xml'/></input></configuration>"
