@@ -23,16 +23,18 @@ FILTERS = ("ekf", "ukf", "enkf", "mhe", "blend")
 CASES = [(name, n_queries) for name in FILTERS for n_queries in (0, 1)]
 every_case = pytest.mark.parametrize(("estimator", "n_queries"), CASES)
 
-MOST_GROWTH = dict.fromkeys(CASES, 0.05) | {("enkf", 0): 0.08}
+MOST_GROWTH = dict.fromkeys(CASES, 0.05) | {("enkf", 0): 0.08, ("blend", 0): 0.06}
 """Upper ends of 95 % intervals of how much errors may grow from a budget to the next.
 
 Of the EnKF without queries it is 7.5 %, from 47.3 to 48.1 veh/km; without any sensor it has 48.7.
+Of the blend it is 5.3 %, from 55.1 to 56.3 veh/km.
 """
-MOST_HARM = dict.fromkeys(CASES, 0.03) | {("ekf", 0): 0.09, ("blend", 0): 0.1}
+MOST_HARM = dict.fromkeys(CASES, 0.03) | {("ekf", 0): 0.09, ("blend", 0): 0.1, ("mhe", 1): 0.06}
 """How much larger errors may be with sensors than without, at the same budget.
 
 Sensors at the road's outputs alone tell of its entry a minute later. Without queries the EKF errs
-by 54 to 56 veh/km with them and 52 without, and the blend by 55 to 58 and 53.
+by 54 to 56 veh/km with them and 52 without, and the blend by 55 to 58 and 53. With one query at an
+epsilon of 1 the MHE loses 5.5 % by sensors, which pay from the same budget.
 """
 BEFORE = {
     "ekf": (17.137, 10.596),
