@@ -135,12 +135,12 @@ def difference(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: st
     return mean_interval(own[0] - other[0])
 
 
-def below(rows: pl.DataFrame, labels: Labels, reference: Labels) -> Interval:
+def below(rows: pl.DataFrame, labels: Labels, reference: Labels, metric: str = ERROR) -> Interval:
     """Return by how much the mean error of a cell lies below that of a reference [%], paired.
 
     The interval is that of the difference over the mean of the reference.
     """
-    own, other = paired(rows, (ERROR, [labels]), (ERROR, [reference]))
+    own, other = paired(rows, (metric, [labels]), (metric, [reference]))
     scale, found = 100.0 / float(other.mean()), mean_interval(other[0] - own[0])
     return Interval(scale * found.mean, scale * found.low, scale * found.high, found.n)
 

@@ -3,7 +3,8 @@
 In the part ``estimators`` every vehicle answers queries: errors of every estimator under every
 release model, how honest its deviations are, and how the recurrent network does away from what it
 was trained on. In the part ``penetration`` a share p of the vehicles is connected and answers
-queries, beside three detectors on the mainline that count every vehicle.
+queries, beside three detectors on the mainline that count every vehicle. In the part ``loops``
+stations of loop detectors stand in place of these.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from agents.tables import (
     below,
     chi2_text,
     format_interval,
+    format_number,
     format_range,
     give_or_take,
     mean,
@@ -172,6 +174,57 @@ SENSED_CELLS = [
     )
 ]
 
+# ---- The third part: loop detectors beside queries, and alone. ----
+
+LOOPED = (LEARNED, "ukf", SMOOTHING)
+"""The network, the best filter beside loops, and adaptive smoothing."""
+LINES = "straight lines"
+STATIONS = (0.0, 0.5, 1.0, 1.5)
+"""Positions of stations [km]."""
+LOOP_INTERVALS = (20, 60, 300)
+LOOP_SHARES = (1.0, 0.2, 0.1)
+NOBODY = "none"
+"""The policy that queries nothing."""
+LOOP_SEEDS = SEEDS[:8]
+
+
+def beside_loops(
+    estimator: str, interval: int, share: float = 1.0, policy: str = ROUND_ROBIN
+) -> Labels:
+    """Return the labels of an estimator with loops of an interval [s], 0 for none of them."""
+    own = {"estimator": estimator, "share": share, "policy": policy}
+    return {"part": "loops", "interval": interval, **own}
+
+
+def looped_cell(labels: Labels) -> Cell:
+    """Return the cell of `beside_loops` labels."""
+    estimator, share, interval = (labels[name] for name in ("estimator", "share", "interval"))
+    keywords: dict[str, Any] = {
+        "estimator": "agents.studies.straight_lines:StraightLines"
+        if estimator == LINES
+        else estimator,
+        "bandwidth": 5,
+        "corridor": {"fixed_sensors": []},
+    }
+    if interval:
+        keywords["loops"] = {"positions": list(STATIONS), "interval": interval}
+    if share < 1.0:
+        keywords["penetration"] = {"share": share}
+        if estimator == LEARNED:
+            keywords["fusion"] = {"dwell_factor": 1.0}
+    seeds, watchers = LOOP_SEEDS, ("honesty",)
+    return Cell(PRIVATE, labels["policy"], keywords, labels, watchers=watchers, seeds=seeds)
+
+
+LOOPED_CELLS = [
+    looped_cell(labels)
+    for labels in (
+        *(beside_loops(*each) for each in product(LOOPED, (0, *LOOP_INTERVALS), LOOP_SHARES)),
+        *(beside_loops(*each, policy=NOBODY) for each in product(LOOPED, (0, *LOOP_INTERVALS))),
+        *(beside_loops(LINES, interval, policy=NOBODY) for interval in LOOP_INTERVALS),
+    )
+]
+
 # ---- Tables. ----
 
 
@@ -255,6 +308,39 @@ def sensed_tables(rows: pl.DataFrame) -> list[str]:
     return [*parts, title, table("", everyone, columns)]
 
 
+LOOP_NOTES = f"""PrivateHighway-v1 without fixed sensors, round robin with 5 queries a second or no
+query, stations at {", ".join(f"{at:g}" for at in STATIONS)} km, traffic seeds
+{format_range(LOOP_SEEDS)}. Density RMSE [veh/km]; in brackets by how many per cent of the error
+without loops it lies below that, paired, and bold where it is certain. Readings are outside of the
+budget. Straight lines between stations stay until the next reading."""
+
+
+def loop_table(rows: pl.DataFrame) -> list[str]:
+    """Return the table of the third part: a line for each estimator and share, and for none."""
+
+    def error(labels: Labels, interval: int) -> str:
+        own = {**labels, "interval": interval}
+        text = format_number(mean(rows, own, DENSITY).mean)
+        if interval == 0 or labels["estimator"] == LINES:
+            return text
+        found = below(rows, own, {**labels, "interval": 0}, DENSITY)
+        gain = f"{found.mean:.0f}"
+        return f"{text} ({f'**{gain}**' if found.low > 0.0 else gain})"
+
+    lines = {
+        f"{LABELS[name]}, queries, p = {share:g}": beside_loops(name, 0, share)
+        for share, name in product(LOOP_SHARES, LOOPED)
+    }
+    lines |= {f"{LABELS[each]}": beside_loops(each, 0, policy=NOBODY) for each in LOOPED}
+    lines[LINES] = beside_loops(LINES, 0, policy=NOBODY)
+    columns: dict[str, Callable[[Any], str]] = {
+        f"every {interval} s" if interval else "no loops": partial(error, interval=interval)
+        for interval in (0, *LOOP_INTERVALS)
+    }
+    columns["χ², every 60 s"] = lambda c: chi2_text(rows, {**c, "interval": 60})
+    return ["# Loop detectors", LOOP_NOTES, table("", lines, columns)]
+
+
 # ---- Figures. ----
 
 
@@ -310,7 +396,7 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return the tables of both parts, and draw their figures."""
     for name, (draw, title) in FIGURES.items():
         save_measured(folder / name, f"{title}, 95 % intervals", draw, rows)
-    return "\n\n".join([*world_tables(rows), *sensed_tables(rows)])
+    return "\n\n".join([*world_tables(rows), *sensed_tables(rows), *loop_table(rows)])
 
 
-STUDY = Study("estimators", (*WORLD_CELLS, *SENSED_CELLS), SEEDS, report)
+STUDY = Study("estimators", (*WORLD_CELLS, *SENSED_CELLS, *LOOPED_CELLS), SEEDS, report)

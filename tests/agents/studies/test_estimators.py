@@ -74,3 +74,28 @@ def test_it_plays_and_reports(tmp_path):
     assert len(rows) == 4
     error = -1000.0 * rows.filter(estimator="ekf")["reward"].mean()
     assert f"| ShortHighway-v0 | {error:.1f} [" in (tmp_path / "tables.md").read_text("utf-8")
+
+
+def test_loops_stand_beside_queries_and_alone():
+    cells = study.LOOPED_CELLS
+    assert len({cell.id for cell in cells}) == len(cells)
+    for cell in cells:
+        assert ("loops" in cell.keywords) == (cell.labels["interval"] > 0)
+        assert cell.keywords["corridor"] == {"fixed_sensors": []}
+
+
+def test_straight_lines_join_the_last_readings():
+    road = {"estimator": "agents.studies.straight_lines:StraightLines", "traffic_seeds": [0]}
+    loops = {"positions": [0.0, 0.4], "interval": 5}
+    keywords = {**road, "privacy": "paced", "epsilon": 5.0, "loops": loops}
+    keywords["corridor"] = {"fixed_sensors": []}
+    env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords).unwrapped
+    env.reset(seed=0)
+    process, nothing = env.process, np.zeros((1, 6), dtype=np.int8)
+    for _ in range(40):
+        process.step(np.arange(1), nothing)
+    said = process.loops.said(process.traffic.readings[:1, 40 // 5 - 1])
+    first, last = said.density[0, 0], said.density[0, -1]
+    line = [first, *np.linspace(first, last, 5)[1:], last]
+    np.testing.assert_allclose(process.estimate.density[0, :6], line)
+    assert process.estimate.speed[0, :6].min() > 0.0
