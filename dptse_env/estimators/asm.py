@@ -4,11 +4,13 @@ For a place x and the present second t, over released values z_j of places x_j a
 t, two means are taken, one along the waves of free traffic and one along those of congested
 traffic, c = c_free > 0 and c = -c_jam < 0:
 
-    z_c(x) = sum_j phi_c z_j / sum_j phi_c
+    z_c(x) = sum_j w_j phi_c z_j / sum_j w_j phi_c
     phi_c = exp(-|x_j - x| / s - |t_j - t - (x_j - x) / c| / tau)
 
-They are the same for densities and speeds. Their weights depend on the slower of both speeds,
-m = (1 + tanh((V - v) / dV)) / 2 with v = min(v_free, v_jam):
+The kernels are the same for densities and speeds. A value whose noise has the variance V_j weighs
+w_j = `TRUSTED` / (`TRUSTED` + V_j), a density and its speed each for itself. The weights of both
+means depend on the slower of their speeds, m = (1 + tanh((V - v) / dV)) / 2 with
+v = min(v_free, v_jam):
 
     z(x) = m z_jam(x) + (1 - m) z_free(x)
 
@@ -21,10 +23,10 @@ What the model's inputs say of the ends of the road are values as well, half a s
 behind an exit drivers keep their w = v + p(rho). The prior is a value of second 0.
 
 Sums over all seconds take no history of releases. With the decay r = exp(-1 / tau) of a step and
-P_t = r P_{t-1} + z_t, the sum of a place over the seconds of all ages a with a wave that takes L to
-arrive, f = floor(L), is
+P_t = r P_{t-1} + w_t z_t, the sum of a place over the seconds of all ages a with a wave that takes
+L to arrive, f = floor(L), is
 
-    sum_a exp(-|a - L| / tau) z_{t-a} = exp(-L / tau) P_t
+    sum_a exp(-|a - L| / tau) w_{t-a} z_{t-a} = exp(-L / tau) P_t
         + exp(-(L - f) / tau) sum_{a=1..f} (1 - r^2) r^{f-a} P_{t-a}
         + (exp(-(f + 1 - L) / tau) - r exp(-(L - f) / tau)) P_{t-f-1}
 
@@ -70,8 +72,12 @@ LEAST_LANE_DENSITY = 15.0
 """Density of a lane [veh/km] below which a flow is mostly noise."""
 LEAST_WEIGHT = 1e-100
 FREE, JAM = 0, 1
-WEIGHT, DENSITY, SPEED, DENSITY_NOISE, SPEED_NOISE = range(5)
-"""Sums: of weights, of weights times values, and of squared weights times variances of noise."""
+WEIGHT, VALUE, NOISE = 0, 2, 4
+"""Sums of densities, and of speeds each one further on: of weights, of weights times values, and
+of squared weights times variances of noise."""
+TRUSTED = 30.0**2, 50.0**2
+"""Variances of the noise of a lane's density [(veh/km)^2] and of a speed [(km/h)^2] with which a
+value weighs half of one without noise."""
 DENSITY_MODEL = 0.8, 0.5
 SPEED_MODEL = 310.0, 0.4
 """Coefficients a [veh^(3/2), 1] and b [(km/h)^2, 1] of the variance that is smoothed away."""
@@ -105,9 +111,9 @@ class Stencil(NamedTuple):
 class State(NamedTuple):
     """The sums and estimates of n episodes."""
 
-    past: FloatArray  # (n, J, H, 5) P of the last H steps, each in turn
+    past: FloatArray  # (n, J, H, 6) P of the last H steps, each in turn
     place: IntArray  # (n,) where the present one is
-    sums: FloatArray  # (n, S, 2, 5) of both waves
+    sums: FloatArray  # (n, S, 2, 6) of both waves
     present: FloatArray  # (n, S, 4) density, speed and their deviations
     priors: FloatArray  # (n, S, 4)
     smoothed: FloatArray  # (n, S, 2) variances of what is smoothed away, without their factors
@@ -213,10 +219,8 @@ def _restart(road: Road, state: State, e: int) -> None:
     state.innovations[e] = 0.0
     for s in range(road.n_segments):
         lanes, known = road.lanes[s], past[s, 0]
-        known[WEIGHT] = 1.0
-        known[DENSITY], known[SPEED] = prior[s, 0] / lanes, prior[s, 1]
-        known[DENSITY_NOISE] = (prior[s, 2] / lanes) ** 2
-        known[SPEED_NOISE] = prior[s, 3] ** 2
+        _weigh(0, 1.0, prior[s, 0] / lanes, (prior[s, 2] / lanes) ** 2, known)
+        _weigh(1, 1.0, prior[s, 1], prior[s, 3] ** 2, known)
         for j in range(4):
             state.present[e, s, j] = prior[s, j]
         state.smoothed[e, s] = 0.0
@@ -234,12 +238,12 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
         state.place[e] = place
         for j in range(past.shape[0]):
             old, new = past[j, before], past[j, place]
-            # Stop decaying before the weight underflows, so that the last mean is kept.
-            r = stencil.decay if old[WEIGHT] > LEAST_WEIGHT else 1.0
-            for c in range(DENSITY_NOISE):
-                new[c] = r * old[c]
-            for c in range(DENSITY_NOISE, 5):
-                new[c] = r * r * old[c]
+            for i in range(2):
+                # Stop decaying before the weight underflows, so that the last mean is kept.
+                r = stencil.decay if old[WEIGHT + i] > LEAST_WEIGHT else 1.0
+                new[WEIGHT + i] = r * old[WEIGHT + i]
+                new[VALUE + i] = r * old[VALUE + i]
+                new[NOISE + i] = r * r * old[NOISE + i]
         if stencil.boundary_weight > 0.0:
             _read_ends(road, arz, stencil, inputs[k], present, past, place)
         for s in range(road.n_segments):
@@ -271,16 +275,26 @@ def _read_ends(
         w = inputs[column + 1]
         rho = entry_density(inputs[column], w, v_f, gamma, jam[cell])
         new = past[S + b, place]
-        new[WEIGHT] += weight
-        new[DENSITY] += weight * rho / road.lanes[cell]
-        new[SPEED] += weight * (w - pressure(rho, jam[cell], v_f, gamma))
+        _weigh(0, weight, rho / road.lanes[cell], 0.0, new)
+        _weigh(1, weight, w - pressure(rho, jam[cell], v_f, gamma), 0.0, new)
     for b in range(road.exits.size):
         s, cell, rho = road.exits[b], road.exit_cells[b], inputs[road.exit_inputs[b]]
         w = present[s, 1] + pressure(present[s, 0], jam[s], v_f, gamma)
         new = past[S + road.entries.size + b, place]
-        new[WEIGHT] += weight
-        new[DENSITY] += weight * rho / road.lanes[cell]
-        new[SPEED] += weight * max(w - pressure(rho, jam[cell], v_f, gamma), 0.0)
+        _weigh(0, weight, rho / road.lanes[cell], 0.0, new)
+        _weigh(1, weight, max(w - pressure(rho, jam[cell], v_f, gamma), 0.0), 0.0, new)
+
+
+@inline_part
+def _weigh(i: int, weight: float, value: float, noise: float, sums: FloatArray) -> None:
+    """Add a density (i = 0) or a speed (1), whose noise has a variance, to the sums of a place.
+
+    It counts as `weight` independent values of this variance.
+    """
+    trust = TRUSTED[i] / (TRUSTED[i] + noise)
+    sums[WEIGHT + i] += weight * trust
+    sums[VALUE + i] += weight * trust * value
+    sums[NOISE + i] += weight * trust**2 * noise
 
 
 @kernel_part
@@ -314,25 +328,27 @@ def _sum(stencil: Stencil, past: FloatArray, place: int, sums: FloatArray) -> No
         own, now = past[j], past[j, place]
         a, t = 0, place
         # Sums of P over the ages up to a, the latest of the least weight.
-        w, x, y, n, o = 0.0, 0.0, 0.0, 0.0, 0.0
+        w, u, x, y, n, o = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for q in range(stencil.first[j], stencil.first[j + 1]):
             # sum_{a=1..f} (1 - r^2) r^{f-a} P_{t-a}
             while a < stencil.delay[q]:
                 a += 1
                 t = t - 1 if t > 0 else H - 1
                 w = r * w + (1.0 - r2) * own[t, 0]
-                x = r * x + (1.0 - r2) * own[t, 1]
-                y = r * y + (1.0 - r2) * own[t, 2]
-                n = r2 * n + (1.0 - r2 * r2) * own[t, 3]
-                o = r2 * o + (1.0 - r2 * r2) * own[t, 4]
+                u = r * u + (1.0 - r2) * own[t, 1]
+                x = r * x + (1.0 - r2) * own[t, 2]
+                y = r * y + (1.0 - r2) * own[t, 3]
+                n = r2 * n + (1.0 - r2 * r2) * own[t, 4]
+                o = r2 * o + (1.0 - r2 * r2) * own[t, 5]
             # with the factors of P_t, of this sum and of P_{t-f-1}
             old = own[t - 1 if t > 0 else H - 1]
             out, f = sums[stencil.target[q], stencil.wave[q]], stencil.weight[q]
             out[0] += f[0, 0] * now[0] + f[0, 1] * w + f[0, 2] * old[0]
-            out[1] += f[0, 0] * now[1] + f[0, 1] * x + f[0, 2] * old[1]
-            out[2] += f[0, 0] * now[2] + f[0, 1] * y + f[0, 2] * old[2]
-            out[3] += f[1, 0] * now[3] + f[1, 1] * n + f[1, 2] * old[3]
-            out[4] += f[1, 0] * now[4] + f[1, 1] * o + f[1, 2] * old[4]
+            out[1] += f[0, 0] * now[1] + f[0, 1] * u + f[0, 2] * old[1]
+            out[2] += f[0, 0] * now[2] + f[0, 1] * x + f[0, 2] * old[2]
+            out[3] += f[0, 0] * now[3] + f[0, 1] * y + f[0, 2] * old[3]
+            out[4] += f[1, 0] * now[4] + f[1, 1] * n + f[1, 2] * old[4]
+            out[5] += f[1, 0] * now[5] + f[1, 1] * o + f[1, 2] * old[5]
 
 
 @inline_part
@@ -341,15 +357,14 @@ def _evaluate(road: Road, arz: ARZ, stencil: Stencil, state: State, e: int) -> N
     sums, present, smoothed = state.sums[e], state.present[e], state.smoothed[e]
     for s in range(road.n_segments):
         free, jam, lanes = sums[s, FREE], sums[s, JAM], road.lanes[s]
-        # z_c = sum phi_c z_j / sum phi_c
-        by_free, by_jam = 1.0 / free[WEIGHT], 1.0 / jam[WEIGHT]
-        v_free, v_jam = by_free * free[SPEED], by_jam * jam[SPEED]
+        # z_c = sum w_j phi_c z_j / sum w_j phi_c
+        rho_free, rho_jam = free[VALUE] / free[WEIGHT], jam[VALUE] / jam[WEIGHT]
+        v_free, v_jam = free[VALUE + 1] / free[WEIGHT + 1], jam[VALUE + 1] / jam[WEIGHT + 1]
         # m = (1 + tanh((V - v) / dV)) / 2 and z = m z_jam + (1 - m) z_free
         m = stencil.threshold - min(v_free, v_jam)
         m = 0.5 + 0.5 * math.tanh(m / stencil.transition)
-        by_free, by_jam = (1.0 - m) * by_free, m * by_jam
-        rho = lanes * (by_free * free[DENSITY] + by_jam * jam[DENSITY])
-        gap = lanes * (jam[DENSITY] / jam[WEIGHT] - free[DENSITY] / free[WEIGHT])
+        rho = lanes * ((1.0 - m) * rho_free + m * rho_jam)
+        gap = lanes * (rho_jam - rho_free)
         present[s, 0] = rho = min(max(rho, 0.0), arz.jam[s])
         present[s, 1] = min(max(m * v_jam + (1.0 - m) * v_free, 0.0), stencil.largest_speed)
         # a_1 n^(1/2) / l^2 + a_2 (rho_jam - rho_free)^2 and b_1 / (1 + n) + b_2 (v_jam - v_free)^2
@@ -361,8 +376,8 @@ def _evaluate(road: Road, arz: ARZ, stencil: Stencil, state: State, e: int) -> N
         smoothed[s, 1] = variation + SPEED_MODEL[1] * (v_jam - v_free) ** 2
         share = (state.age[e, s] / (state.age[e, s] + STALE)) ** 2
         for i in range(2):
-            noise = by_free * math.sqrt(max(free[DENSITY_NOISE + i], 0.0))
-            noise += by_jam * math.sqrt(max(jam[DENSITY_NOISE + i], 0.0))
+            noise = (1.0 - m) * math.sqrt(max(free[NOISE + i], 0.0)) / free[WEIGHT + i]
+            noise += m * math.sqrt(max(jam[NOISE + i], 0.0)) / jam[WEIGHT + i]
             if i == 0:
                 noise *= lanes
             unknown = share * STALE_VARIANCE[i] * (lanes**2 if i == 0 else 1.0)
@@ -381,7 +396,7 @@ def _factor(evidence: FloatArray) -> float:
 def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
     """Add what was released of episodes `(k,)` to the sums, and evaluate them."""
     road, arz, channels, stencil, state = bundle.parts
-    added = np.empty((road.n_segments, 5))
+    added = np.empty((road.n_segments, 6))
     for k in range(episodes.size):
         e = episodes[k]
         state.innovations[e] = 0.0
@@ -389,9 +404,11 @@ def update(bundle: Bundle, episodes: IntArray, measured: Measurement) -> None:
         for m in range(channels.first.size):
             if measured.observed[k, m]:
                 value = _read_channel(road, channels, stencil, state, e, m, measured, k)
+                density, density_noise, speed, speed_noise = value
+                share = 1.0 / channels.span[m]
                 for s in range(channels.first[m], channels.first[m] + channels.span[m]):
-                    for c in range(5):
-                        added[s, c] += value[c]
+                    _weigh(0, share, density, density_noise, added[s])
+                    _weigh(1, share, speed, speed_noise, added[s])
         for s in range(road.n_segments):
             if added[s, WEIGHT] > 0.0:
                 _add(stencil, state, e, s, added[s])
@@ -412,11 +429,14 @@ def _read_channel(
     m: int,
     measured: Measurement,
     k: int,
-) -> tuple[float, float, float, float, float]:
+) -> tuple[float, float, float, float]:
     """Write a channel's innovations and what they say of the factors; return its value.
 
     Each of its segments has its average, with a weight and a variance as if they were independent
     values.
+
+    Returns:
+        Density of a lane and its variance, speed and its variance.
     """
     values, sigma, centre = measured.values[k, m], measured.sigma[k, m], measured.centre[k]
     first, span = channels.first[m], channels.span[m]
@@ -455,11 +475,10 @@ def _read_channel(
             evidence[0] += gain * (error**2 - known)
             evidence[1] += gain * smoothed
     return (
-        share,
-        share * values[0] / lanes,
-        share * by_flow * (values[1] + carried),
-        share * (sigma[0] / lanes) ** 2,
-        share * (by_flow * sigma[1]) ** 2,
+        values[0] / lanes,
+        (sigma[0] / lanes) ** 2,
+        by_flow * (values[1] + carried),
+        (by_flow * sigma[1]) ** 2,
     )
 
 
@@ -467,13 +486,13 @@ def _read_channel(
 def _add(stencil: Stencil, state: State, e: int, s: int, value: FloatArray) -> None:
     """Add the value of a segment to the sums."""
     now, sums = state.past[e, s, state.place[e]], state.sums[e]
-    for c in range(5):
+    for c in range(6):
         now[c] += value[c]
     for q in range(stencil.first[s], stencil.first[s + 1]):
         out, f = sums[stencil.target[q], stencil.wave[q]], stencil.weight[q]
-        for c in range(DENSITY_NOISE):
+        for c in range(NOISE):
             out[c] += f[0, 0] * value[c]
-        for c in range(DENSITY_NOISE, 5):
+        for c in range(NOISE, 6):
             out[c] += f[1, 0] * value[c]
         state.age[e, stencil.target[q]] = 0.0
 
@@ -496,11 +515,11 @@ class AdaptiveSmoothing(SegmentEstimator):
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
         stencil, n, S = make_stencil(model, settings.asm), n_episodes, model.n_segments
-        shape = n, stencil.first.size - 1, int(stencil.delay.max()) + 2, 5
+        shape = n, stencil.first.size - 1, int(stencil.delay.max()) + 2, 6
         self.state = State(
             past=np.zeros(shape),
             place=np.zeros(n, dtype=np.int64),
-            sums=np.zeros((n, S, 2, 5)),
+            sums=np.zeros((n, S, 2, 6)),
             present=self.present,
             priors=self.priors,
             smoothed=np.zeros((n, S, 2)),
