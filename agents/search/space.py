@@ -86,7 +86,7 @@ EXTRAS: dict[Extra, dict[str, Knob]] = {
     "demand": {
         **_VEHICLES,
         "demand.deviation": evenly(0.02, 0.6),
-        "demand.walk": evenly(1e-3, 0.3),
+        "demand.memory": evenly(10.0, 1e3),
     },
     "speed-cap": {"speed_cap": CategoricalDistribution((None, 0.95, 1.0, 1.05))},
 }
@@ -94,9 +94,8 @@ EXTRAS: dict[Extra, dict[str, Knob]] = {
 
 DEMAND_START = EstimatorSettings(
     process_noise=(5e-4, 5e-4),
-    vehicle_noise=(0.035, 0.02),
+    vehicle_noise=(0.045, 0.021),
     flicker=True,
-    noise_scale=(1.0, 1.2),
     demand=DemandSettings(),
 )
 """The settings with demand states from which a search begins."""

@@ -124,13 +124,13 @@ def require_time_step(estimator: Any, model: ARZModel) -> None:
 
 def with_demand(model: ARZModel, settings: Any) -> ARZModel:
     """Return a model that has demand states where the settings ask for them, and only there."""
-    has_demand = getattr(settings, "demand", None) is not None
-    if has_demand == (model.n_demand_states > 0):
+    demand = getattr(settings, "demand", None)
+    memory = None if demand is None else demand.memory
+    if memory == model.demand_memory:
         return model
     return ARZModel(
-        model.road, model.parameters, model.time_step, model.centre, model.channels,
-        has_demand,
-    )  # fmt: skip
+        model.road, model.parameters, model.time_step, model.centre, model.channels, memory
+    )
 
 
 def make_estimator(

@@ -352,9 +352,11 @@ class EKF(CovarianceFilter):
 
 def process_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
     """Return the variances, shape (n_x,), of a step's process noise at a density of zero."""
-    traffic = np.tile(settings.process_noise, model.n_segments)
-    walk = 0.0 if settings.demand is None else settings.demand.walk
-    return np.concatenate([traffic, np.full(model.n_demand_states, walk)]) ** 2
+    traffic = np.tile(np.square(settings.process_noise), model.n_segments)
+    deviation = 0.0 if settings.demand is None else settings.demand.deviation
+    # With this noise the variance of a factor stays that of its prior.
+    variance = deviation**2 * (1.0 - model.arz.kept**2)
+    return np.concatenate([traffic, np.full(model.n_demand_states, variance)])
 
 
 def initial_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:

@@ -37,12 +37,13 @@ def multiply(
     out: FloatArray,
     is_lower: bool,
 ) -> None:
-    """Write A right to `out`; demand factors, the last components, stay.
+    """Write A right to `out`; the last components are demand factors.
 
     Args:
         road: The road, for the cells of the blocks.
         blocks: `(S, K, 4)` 2x2 blocks of A, of each segment by its neighbours.
-        by_factor: `(E, 2)` derivatives of the entries' segments by the demand factors.
+        by_factor: `(E, 3)` derivatives of the entries' segments, and of the factors themselves, by
+            the demand factors.
         right: `(n_x, width)`.
         out: `(n_x, width)`, another matrix.
         is_lower: Whether to write only the lower half and the registers on the diagonal.
@@ -66,14 +67,14 @@ def multiply(
                 lower[j] = lower[j] + d * first[j] + e * second[j]
     for k in range(right.shape[0] - n):
         upper, lower, factor = out[2 * road.entries[k]], out[2 * road.entries[k] + 1], right[n + k]
-        a, b, kept = by_factor[k, 0], by_factor[k, 1], out[n + k]
+        a, b, kept, later = by_factor[k, 0], by_factor[k, 1], by_factor[k, 2], out[n + k]
         if is_lower:
             width = to_diagonal(2 * road.entries[k])
         for j in range(width):
             upper[j] += a * factor[j]
             lower[j] += b * factor[j]
         for j in range(right.shape[1]):
-            kept[j] = factor[j]
+            later[j] = kept * factor[j]
 
 
 @kernel_part
@@ -98,7 +99,7 @@ def apply(
         c = road.entries[e]
         out[2 * c] += by_factor[e, 0] * x[n + e]
         out[2 * c + 1] += by_factor[e, 1] * x[n + e]
-        out[n + e] = x[n + e]
+        out[n + e] = by_factor[e, 2] * x[n + e]
 
 
 @kernel_part
@@ -121,7 +122,8 @@ def apply_transposed(
             out[2 * b + 1] += block[1] * first + block[3] * second
     for e in range(n_factors):
         c = road.entries[e]
-        out[n + e] = x[n + e] + by_factor[e, 0] * x[2 * c] + by_factor[e, 1] * x[2 * c + 1]
+        out[n + e] = by_factor[e, 2] * x[n + e]
+        out[n + e] += by_factor[e, 0] * x[2 * c] + by_factor[e, 1] * x[2 * c + 1]
 
 
 @kernel_part(fastmath={"contract"})
@@ -140,7 +142,7 @@ def propagate(
     Args:
         road: The road, for the cells of the blocks.
         blocks: `(S, K, 4)` blocks of A.
-        by_factor: `(E, 2)` derivatives by the demand factors.
+        by_factor: `(E, 3)` derivatives by the demand factors.
         noise: `(n_x,)` variances of Q; see `add_noise`.
         slopes: `(S,)` slopes of Q.
         covariance: `(n_x, padded)` P, of which both halves are read.

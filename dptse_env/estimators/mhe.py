@@ -74,7 +74,7 @@ class Windows(NamedTuple):
     process_variance: FloatArray  # (n, L, n_x) likewise
     slopes: FloatArray  # (n, L, S) likewise
     blocks: FloatArray  # (n, L, S, K, 4) likewise
-    by_factor: FloatArray  # (n, L, E, 2) likewise, of the demand factors; E = 0 without
+    by_factor: FloatArray  # (n, L, E, 3) likewise, of the demand factors; E = 0 without
     offsets: FloatArray  # (n, L, n_x) likewise
     observed: BoolArray  # (n, L, M)
     values: FloatArray  # (n, L, M, 2)
@@ -200,7 +200,7 @@ def _linearise_step(
     for i in range(state.size):
         state[i] /= windows.units[i]
     apply(road, blocks, scratch.by_factor, n_factors, state, product)
-    for i in range(state.size - n_factors):  # b = f(x, u) - A x
+    for i in range(state.size):  # b = f(x, u) - A x
         windows.offsets[e, t, i] = after[i] / windows.units[i] - product[i]
 
 
@@ -444,7 +444,7 @@ def _allocate(model: ARZModel, settings: EstimatorSettings, fallback: BoolArray)
         process_variance=np.ones((*shape, n)),
         slopes=np.zeros((*shape, model.n_segments)),
         blocks=np.zeros((*shape, *model.road.neighbours.shape, 4)),
-        by_factor=np.zeros((*shape, model.n_demand_states, 2)),
+        by_factor=np.zeros((*shape, model.n_demand_states, 3)),
         offsets=np.zeros((*shape, n)),
         observed=np.zeros((*shape, n_channels), dtype=np.bool_),
         values=np.zeros((*shape, n_channels, 2)),
@@ -472,7 +472,7 @@ def moving_variance(model: ARZModel, settings: EstimatorSettings) -> FloatArray:
     """Return the arrival variances `(n_x,)` of a window that moves.
 
     They are those of `arrival_noise`, and for demand factors those of the prior: a window of the
-    default length says less about a factor than its random walk takes away, and an overconfident
+    default length says less about a factor than its noise takes away, and an overconfident
     arrival keeps a wrong factor for many windows.
     """
     variance = initial_variance(model, settings)

@@ -61,7 +61,7 @@ class Window(NamedTuple):
     arrival: FloatArray  # (n_x,) mean of the first state
     arrival_variance: FloatArray  # (n_x,)
     blocks: FloatArray  # (L, S, K, 4) of the transitions A that leave each stage
-    by_factor: FloatArray  # (L, E, 2) derivatives of the entries' segments by demand factors
+    by_factor: FloatArray  # (L, E, 3) derivatives by demand factors; see `multiply`
     offsets: FloatArray  # (L, n_x)
     process_variance: FloatArray  # (L, n_x) of Q; see `add_noise`
     slopes: FloatArray  # (L, S) of Q
@@ -481,7 +481,7 @@ def write_diagonal(road: Road, channels: Channels, window: Window, diagonal: Flo
             c, by_factor = road.entries[e], window.by_factor[t, e]
             beside = by_factor[1] - window.slopes[t, c] * by_factor[0]
             out[n + e] += by_factor[0] ** 2 / K[2 * c] + beside**2 / K[2 * c + 1]
-            out[n + e] += 1.0 / K[n + e]
+            out[n + e] += by_factor[2] ** 2 / K[n + e]
 
 
 @kernel_part

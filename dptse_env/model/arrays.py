@@ -65,6 +65,7 @@ class ARZ(NamedTuple):
     gamma: float  # exponent of the pressure
     step_ratio: FloatArray  # (S,) T / l [h/km]
     relaxation: float  # T / tau
+    kept: float  # exp(-T / memory), what a step keeps of a demand factor's distance from 1
     jam: FloatArray  # (S + R,) jam densities rho_m of cells [veh/km]
     term_weight: FloatArray  # (T,) weight of the outflow's gradient in the Jacobian [h/km]
     second_scale: float  # unit of the second number of a channel [km/h or veh/h]

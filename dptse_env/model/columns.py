@@ -210,6 +210,10 @@ def advance_states(
         _leave(rho, psi, scratch.flow[c], scratch.w[c], ratio[c], arz.relaxation, v_f)
     for e in range(road.entries.size):
         _enter(road, arz, scratch, e, inputs, states)
+    for i in range(2 * road.n_segments, states.shape[0]):
+        factor = states[i]
+        for j in range(factor.size):
+            factor[j] = 1.0 + arz.kept * (factor[j] - 1.0)
     for e in range(road.edges.shape[0]):
         start, end = road.edges[e, 0], road.edges[e, 1]
         part = ratio[end] * road.edge_share[e]

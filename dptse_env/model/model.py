@@ -6,9 +6,10 @@ Inputs `u = [D_in, w_in, rho_out, D_on1, w_on1, ..., rho_off1, ...]`: demands at
 with their w [km/h], and densities behind the exits [veh/km]. Arrays have a leading batch axis n.
 
 With demand states the state has a further component for each entry at its end: a factor on the
-demand that the inputs give there, which a step leaves as it is.
+demand that the inputs give there, which returns to 1: x' = 1 + exp(-T / memory) (x - 1).
 """
 
+import math
 from functools import cached_property
 
 import numpy as np
@@ -43,12 +44,14 @@ class ARZModel:
             None where they release the speed. A release may have a centre of its own for each
             segment in its place.
         channels: What is measured, on segments; None for each of them by itself.
-        demand_states: Whether the state has a factor on the demand of each entry.
+        demand_memory: Seconds in which a factor on the demand of an entry returns to 1; None for a
+            state without such factors.
 
     Attributes:
         n_segments: Segments S.
         n_demand_states: Demand factors E in the state: 1 + I or 0.
         n_states: Components n_x of a state, 2 S + E.
+        demand_memory: As given.
         n_inputs: Components n_u of the inputs, 3 + 2 I + O.
         n_boundaries: Boundary cells R.
         arz: Numbers of the model for kernels.
@@ -72,12 +75,13 @@ class ARZModel:
         time_step: float = 1.0,
         centre: float | None = None,
         channels: Channels | None = None,
-        demand_states: bool = False,
+        demand_memory: float | None = None,
     ) -> None:
         """Derive what the equations need."""
         self.road, self.parameters, self.time_step = road, parameters, time_step
         self.n_segments = road.n_segments
-        self.n_demand_states = road.entries.size if demand_states else 0
+        self.n_demand_states = 0 if demand_memory is None else road.entries.size
+        self.demand_memory = demand_memory
         self.n_states = 2 * self.n_segments + self.n_demand_states
         self.n_inputs, self.n_boundaries = road.n_inputs, road.beside.size
         per_lane = parameters.jam_density / parameters.lanes
@@ -108,6 +112,7 @@ class ARZModel:
             gamma=float(parameters.gamma),
             step_ratio=step_ratio,
             relaxation=float(time_step / parameters.relaxation_time),
+            kept=1.0 if demand_memory is None else math.exp(-time_step / demand_memory),
             jam=per_lane * road.lanes,
             term_weight=step_ratio[road.terms[:, 0]] * road.term_share,
             second_scale=float(second),

@@ -46,7 +46,7 @@ class Scratch(NamedTuple):
     cells: FloatArray  # (S, 9) w, speed and demand of each cell and their derivatives
     outflow: FloatArray  # (S, 2) q and phi out of each cell
     gradient: FloatArray  # (S, 3, 4) derivatives of (q, phi) by each party's (rho, psi)
-    # (1 + I, 2) derivatives of each entry's next (rho, psi) by its demand factor
+    # (1 + I, 3) derivatives of each entry's next (rho, psi) and factor by its demand factor
     by_factor: FloatArray
 
 
@@ -54,7 +54,7 @@ class Scratch(NamedTuple):
 def make_scratch(road: Road) -> Scratch:
     """Allocate the working space for a road."""
     n = road.n_segments
-    by_factor = np.zeros((road.entries.size, 2))
+    by_factor = np.zeros((road.entries.size, 3))
     return Scratch(np.empty((n, 9)), np.empty((n, 2)), np.zeros((n, 3, 4)), by_factor)
 
 
@@ -308,9 +308,11 @@ def advance(
         after[2 * c + 1] = psi - ratio[c] * outflow[c, 1] + relaxation * (v_f * rho - psi)
         blocks[c, 0, 0] = 1.0
         blocks[c, 0, 2], blocks[c, 0, 3] = relaxation * v_f, 1.0 - relaxation
-    for i in range(2 * road.n_segments, state.size):
-        after[i] = state[i]
     _sources(road, arz, cells, state, inputs, after, blocks, scratch.by_factor)
+    n = 2 * road.n_segments
+    for e in range(state.size - n):
+        after[n + e] = 1.0 + arz.kept * (state[n + e] - 1.0)
+        scratch.by_factor[e, 2] = arz.kept
 
     for e in range(road.edges.shape[0]):
         start, end = road.edges[e, 0], road.edges[e, 1]
@@ -352,7 +354,7 @@ def jacobians(
                     derivatives[i, 2 * c + k // 2, 2 * b + k % 2] = blocks[c, slot, k]
         for j in range(2 * road.n_segments, after.size):
             e = j - 2 * road.n_segments
-            derivatives[i, j, j] = 1.0
+            derivatives[i, j, j] = scratch.by_factor[e, 2]
             for k in range(2):
                 derivatives[i, 2 * road.entries[e] + k, j] = scratch.by_factor[e, k]
 

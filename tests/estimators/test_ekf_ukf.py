@@ -130,7 +130,7 @@ def test_the_ekfs_agree_over_a_recorded_episode_and_beat_walk_and_model(release)
 SEEN = {"a pair": [(4, 2)], "what overlaps": [(4, 2), (5, 3), (5, 1), (16, 1)]}
 # So little uncertainty that the model is linear within it.
 SMALL, STEP_NOISE, VEHICLE_NOISE = 1e-5, (2e-5, 1e-5), (5e-5, 3e-5)
-FACTOR, WALK = 1e-3, 1e-5  # deviations of demand factors
+FACTOR, MEMORY = 1e-3, 50.0  # deviation and memory [s] of demand factors
 
 
 def derivative(function, x, scale):
@@ -148,7 +148,8 @@ def textbook(model, name, x, inputs, values, sigma, centre, rows):
     unit = model.density_scale * np.array([1.0, v_f])
     n_factors = model.n_states - 2 * S
     variance = np.square([SMALL] * 2 * S + [FACTOR] * n_factors)
-    noise = np.diag([*np.tile(np.square(STEP_NOISE), S), *np.full(n_factors, WALK**2)])
+    of_factors = FACTOR**2 * (1.0 - np.exp(-2.0 / MEMORY))
+    noise = np.diag([*np.tile(np.square(STEP_NOISE), S), *np.full(n_factors, of_factors)])
     of_vehicles, of_psi = np.square(VEHICLE_NOISE)
     for s, (rho, psi) in enumerate(x[: 2 * S].reshape(S, 2) / unit):
         block = of_vehicles * np.outer([rho, psi], [rho, psi]) / rho + np.diag([0.0, of_psi * rho])
@@ -189,7 +190,7 @@ def test_an_update_is_that_of_a_kalman_filter(name, backend, seen):
         process_noise=STEP_NOISE,
         vehicle_noise=VEHICLE_NOISE,
         initial_variance=SMALL**2,
-        demand=DemandSettings(deviation=FACTOR, walk=WALK),
+        demand=DemandSettings(deviation=FACTOR, memory=MEMORY),
     )
     estimator = started(name, backend, episodes, settings)
     model, rng = estimator.model, np.random.default_rng(2)

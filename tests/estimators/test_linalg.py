@@ -22,7 +22,7 @@ pair_update, products, propagate, scalar_update, solve, solve_many = (
     )
 )  # fmt: skip
 
-MODEL = ARZModel(PAPER_HIGHWAY.road, PUBLISHED, demand_states=True)
+MODEL = ARZModel(PAPER_HIGHWAY.road, PUBLISHED, demand_memory=120.0)
 ROAD, N = MODEL.road, MODEL.n_states
 WIDTH = linalg.padded(N)
 
@@ -39,15 +39,15 @@ def random_step(rng, n_factors):
     """Blocks of a transition, some of them zero, derivatives by the factors, and both as F."""
     blocks = rng.normal(size=(*ROAD.neighbours.shape, 4))
     blocks[rng.random(blocks.shape[:2]) < 0.3] = 0.0
-    by_factor, n = rng.normal(size=(n_factors, 2)), 2 * ROAD.n_segments
+    by_factor, n = rng.normal(size=(n_factors, 3)), 2 * ROAD.n_segments
     dense = np.zeros((n + n_factors, n + n_factors))
     for c in range(ROAD.n_segments):
         for slot in range(ROAD.degree[c]):
             b = ROAD.neighbours[c, slot]
             dense[2 * c : 2 * c + 2, 2 * b : 2 * b + 2] = blocks[c, slot].reshape(2, 2)
     for e, c in enumerate(ROAD.entries[:n_factors]):
-        dense[2 * c : 2 * c + 2, n + e] = by_factor[e]
-        dense[n + e, n + e] = 1.0
+        dense[2 * c : 2 * c + 2, n + e] = by_factor[e, :2]
+        dense[n + e, n + e] = by_factor[e, 2]
     return blocks, by_factor, dense
 
 

@@ -62,7 +62,7 @@ def test_settings_survive_json():
         speed_cap=1.05,
         noise_scale=(1.5, 2.5),
         bounds="box",
-        demand=DemandSettings(walk=0.1),
+        demand=DemandSettings(memory=60.0),
         ukf=SigmaPointSettings(alpha=0.5),
         enkf=EnsembleSettings(inflation=1.1, taper=2.0),
         mhe=HorizonSettings(horizon=4, arrival_noise=(0.1, 0.2)),

@@ -51,7 +51,7 @@ def random_program(n_stages=4, spread=1.0):
         arrival=rng.normal(0.5, spread, N),
         arrival_variance=rng.uniform(0.1, 1.0, N),
         blocks=rng.normal(0.0, 0.5, (n_stages, s, k, 4)),
-        by_factor=rng.normal(0.0, 0.5, (n_stages, n_factors, 2)),
+        by_factor=rng.normal(0.0, 0.5, (n_stages, n_factors, 3)),
         offsets=rng.normal(0.2, 0.1, (n_stages, N)),
         process_variance=rng.uniform(0.01, 0.1, (n_stages, N)),
         slopes=np.zeros((n_stages, s)),
@@ -75,8 +75,8 @@ def transition(window, t):
             A[2 * c : 2 * c + 2, 2 * b : 2 * b + 2] += window.blocks[t, c, slot].reshape(2, 2)
     for e in range(window.by_factor.shape[1]):
         factor = 2 * ROAD.n_segments + e
-        A[2 * ROAD.entries[e] : 2 * ROAD.entries[e] + 2, factor] = window.by_factor[t, e]
-        A[factor, factor] = 1.0
+        A[2 * ROAD.entries[e] : 2 * ROAD.entries[e] + 2, factor] = window.by_factor[t, e, :2]
+        A[factor, factor] = window.by_factor[t, e, 2]
     return A
 
 

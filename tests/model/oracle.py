@@ -86,7 +86,7 @@ class Oracle:
     imaginary axis gives derivatives without rounding.
     """
 
-    def __init__(self, road, parameters, time_step=1.0):
+    def __init__(self, road, parameters, time_step=1.0, demand_memory=None):
         geometry = road.geometry
         per_lane = parameters.jam_density / parameters.lanes
         self.geometry, self.v_f, self.gamma = geometry, parameters.free_flow_speed, parameters.gamma
@@ -94,6 +94,7 @@ class Oracle:
         self.outer_jam = per_lane * road.road.lanes[self.jam.size :]
         self.ratio = time_step / 3600.0 / np.array(geometry.segment_lengths)
         self.pull = time_step / parameters.relaxation_time
+        self.kept = None if demand_memory is None else np.exp(-time_step / demand_memory)
 
     # Relations: p, sigma, q_max, D and S.
 
@@ -191,6 +192,8 @@ class Oracle:
         before = states.T[0:n:2]
         after[0:n:2] += ratio * rho
         after[1:n:2] += ratio * psi + self.pull * (self.v_f * before - after[1:n:2])
+        if self.kept is not None:
+            after[n:] = self.kept * after[n:] + 1.0 - self.kept
         return after.T
 
     def jacobian(self, states, inputs):

@@ -42,12 +42,12 @@ def advanced(model, states, inputs):
 
 
 @pytest.mark.parametrize(
-    ("road", "parameters", "demand"), pairwise(ROADS, [PUBLISHED, W99], [False, True])
+    ("road", "parameters", "memory"), pairwise(ROADS, [PUBLISHED, W99], [None, 20.0])
 )
-def test_advances_as_the_oracle(road, parameters, demand):
+def test_advances_as_the_oracle(road, parameters, memory):
     """Also where the states fill no whole vectors."""
-    model = ARZModel(ROADS[road].road, parameters, demand_states=demand)
-    oracle, rng = Oracle(ROADS[road], parameters), np.random.default_rng(0)
+    model = ARZModel(ROADS[road].road, parameters, demand_memory=memory)
+    oracle, rng = Oracle(ROADS[road], parameters, demand_memory=memory), np.random.default_rng(0)
     for width in (WIDTH, 1, 3, 77) * 10:
         states, inputs = random_states(model, width, rng), random_inputs(model, 1, rng)
         expected = oracle.step(states, np.repeat(inputs, width, axis=0)) / model.state_scale
@@ -58,7 +58,7 @@ def test_advances_as_the_oracle(road, parameters, demand):
 @everywhere
 @pytest.mark.parametrize("bounds", ["cone", "box"])
 def test_kernels_project_one_state_and_many_as_the_model_does(road, parameters, bounds):
-    model, rng = ARZModel(road.road, parameters, demand_states=True), np.random.default_rng(0)
+    model, rng = ARZModel(road.road, parameters, demand_memory=20.0), np.random.default_rng(0)
     for _ in range(10):
         states = scattered_states(model, WIDTH, rng)
         columns, expected = states.T.copy(), model.project(states, bounds)

@@ -33,14 +33,14 @@ def test_measures_density_and_speed_of_segments_or_averages_of_flows_around_a_ce
 
 
 @pytest.mark.parametrize(
-    ("parameters", "release", "demand"),
-    pairwise([PUBLISHED, W99], ["speeds", "flows", "rows"], [False, True]),
+    ("parameters", "release", "memory"),
+    pairwise([PUBLISHED, W99], ["speeds", "flows", "rows"], [None, 20.0]),
 )
-def test_the_measurement_matrix_is_that_of_central_differences(parameters, release, demand):
+def test_the_measurement_matrix_is_that_of_central_differences(parameters, release, memory):
     speed = None if release == "speeds" else 51.0
     model = ARZModel(
         HIGHWAY.road, parameters, centre=speed,
-        channels=CHANNELS if release == "rows" else None, demand_states=demand,
+        channels=CHANNELS if release == "rows" else None, demand_memory=memory,
     )  # fmt: skip
     rng, floor = np.random.default_rng(1), MEASUREMENT_FLOOR * model.jam_density
     density = rng.uniform(0.0, 1.0, (20, 19)) ** 3 * model.jam_density
@@ -85,7 +85,7 @@ def test_the_cone_holds_speed_and_w_and_leaves_what_is_inside_alone(parameters):
 
 
 def test_the_box_is_the_papers_and_factors_have_bounds_of_their_own():
-    model = ARZModel(HIGHWAY.road, PUBLISHED, demand_states=True)
+    model = ARZModel(HIGHWAY.road, PUBLISHED, demand_memory=20.0)
     assert (model.n_demand_states, model.n_states) == (3, 41)
     np.testing.assert_array_equal(model.state_scale[-3:], np.ones(3))
     wild = np.random.default_rng(3).normal(0.0, 3.0, (200, 41)) * model.state_scale

@@ -30,14 +30,14 @@ advance, make_scratch, write_channel = map(compiled, (advance, make_scratch, wri
 
 
 @pytest.mark.parametrize(
-    ("road", "parameters", "demand"),
-    pairwise(ROADS, [PUBLISHED, W99, NO_RELAXATION], [False, True]),
+    ("road", "parameters", "memory"),
+    pairwise(ROADS, [PUBLISHED, W99, NO_RELAXATION], [None, 20.0]),
 )
 @example(seed=405074828)  # a gap w - v of one rounding, whose power has a steep derivative
 @given(seed=st.integers(0, 2**32 - 1))
-def test_equals_the_oracle(road, parameters, demand, seed):
-    model = ARZModel(ROADS[road].road, parameters, demand_states=demand)
-    oracle, rng = Oracle(ROADS[road], parameters), np.random.default_rng(seed)
+def test_equals_the_oracle(road, parameters, memory, seed):
+    model = ARZModel(ROADS[road].road, parameters, demand_memory=memory)
+    oracle, rng = Oracle(ROADS[road], parameters, demand_memory=memory), np.random.default_rng(seed)
     scale = model.state_scale
     states, inputs = random_states(model, 4, rng), random_inputs(model, 4, rng)
     expected = oracle.step(states, inputs)
@@ -64,7 +64,7 @@ def test_standing_traffic_takes_the_derivative_of_moving_traffic():
 
 
 def test_a_batch_equals_a_loop_a_copy_and_a_kernel_that_overwrites_its_state_to_the_bit():
-    model, rng = ARZModel(HIGHWAY.road, W99, demand_states=True), np.random.default_rng(8)
+    model, rng = ARZModel(HIGHWAY.road, W99, demand_memory=20.0), np.random.default_rng(8)
     states, inputs = random_states(model, 16, rng), random_inputs(model, 16, rng)
     kept = states.copy()
     after, jacobian = model.step(states[::2], inputs[::2]), model.jacobian(states[::2], inputs[::2])
@@ -81,16 +81,16 @@ def test_a_batch_equals_a_loop_a_copy_and_a_kernel_that_overwrites_its_state_to_
 
 
 @pytest.mark.parametrize(
-    ("road", "channels", "speed", "demand"),
+    ("road", "channels", "speed", "memory"),
     [
-        (HIGHWAY, Channels.of_segments(HIGHWAY.road), None, False),
-        (HIGHWAY, CHANNELS, 51.0, True),
-        (UNEVEN, make_channels((6, 0, 2), (2, 1, 3)), 51.0, False),
+        (HIGHWAY, Channels.of_segments(HIGHWAY.road), None, None),
+        (HIGHWAY, CHANNELS, 51.0, 20.0),
+        (UNEVEN, make_channels((6, 0, 2), (2, 1, 3)), 51.0, None),
     ],
 )
-def test_a_kernels_channel_is_the_models_measurement_linearised(road, channels, speed, demand):
+def test_a_kernels_channel_is_the_models_measurement_linearised(road, channels, speed, memory):
     """Empty segments and negative densities among them, as a filter may have."""
-    model = ARZModel(road.road, W99, centre=speed, channels=channels, demand_states=demand)
+    model = ARZModel(road.road, W99, centre=speed, channels=channels, demand_memory=memory)
     rng = np.random.default_rng(2)
     states = scattered_states(model, 20, rng)
     assert (model.components(states)[0] < 0.0).any(axis=0).mean() > 0.8
