@@ -86,7 +86,7 @@ def test_loops_stand_beside_queries_and_alone():
 
 def test_straight_lines_join_the_last_readings():
     road = {"estimator": "agents.studies.straight_lines:StraightLines", "traffic_seeds": [0]}
-    loops = {"positions": [0.0, 0.4], "interval": 5}
+    loops = {"positions": [0.0, 0.4], "interval": 10}
     keywords = {**road, "privacy": "paced", "epsilon": 5.0, "loops": loops}
     keywords["corridor"] = {"fixed_sensors": []}
     env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords).unwrapped
@@ -94,7 +94,7 @@ def test_straight_lines_join_the_last_readings():
     process, nothing = env.process, np.zeros((1, 6), dtype=np.int8)
     for _ in range(40):
         process.step(np.arange(1), nothing)
-    said = process.loops.said(process.traffic.readings[:1, 40 // 5 - 1])
+    said = process.loops.said(process.traffic.readings[:1, 40 // 10 - 1])
     first, last = said.density[0, 0], said.density[0, -1]
     line = [first, *np.linspace(first, last, 5)[1:], last]
     np.testing.assert_allclose(process.estimate.density[0, :6], line)
