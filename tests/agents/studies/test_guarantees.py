@@ -9,7 +9,15 @@ import pytest
 from agents.environments import make_config
 from agents.statistics import mean_interval
 from agents.studies import guarantees
-from agents.studies.guarantees import met_epsilon, paid, priced, report
+from agents.studies.guarantees import (
+    BASE,
+    LADDER,
+    all_cells,
+    met_epsilon,
+    paid,
+    priced,
+    report,
+)
 from agents.study import read_rows
 from agents.tables import DENSITY, format_interval, values
 from dptse_env.parts import privacy_report
@@ -41,7 +49,7 @@ def test_the_tables_are_those_of_the_rows(rows, tmp_path, monkeypatch):
     lines = [line_of(text, f"density RMSE [veh/km]: {each}") for each in ("`paced`", BOTH)]
     expected = [format_interval(mean_interval(each)) for each in (paced, paced - capped)]
     assert [line[4] for line in lines] == expected
-    assert line_of(text, "5. `paced`, demand states, `round-robin` (4)")[1] == expected[0]
+    assert line_of(text, "3. `paced`, EKF, `round-robin` (2)")[1] == expected[0]
     error = values(rows, priced("ekf", "event", epsilon=20.0).labels, DENSITY)
     assert line_of(text, "event")[-1] == format_interval(mean_interval(error))
     # For ε = 5, by both releases, and by densities alone.
@@ -50,19 +58,37 @@ def test_the_tables_are_those_of_the_rows(rows, tmp_path, monkeypatch):
 
 
 def test_a_cell_that_was_not_played_is_a_dash(rows, tmp_path):
-    few = rows.filter(pl.col("cell").is_in([priced("ekf").id, paid(schedule="shift-ahead").id]))
+    own = paid(estimator="random_walk", release="capped")
+    few = rows.filter(pl.col("cell").is_in([priced("random_walk").id, own.id]))
     text = report(few, tmp_path)
-    assert line_of(text, "4. `paced`, demand states, `shift-ahead` (2)")[1:3] == [
-        "17.76 [16.93, 18.59]",
-        "-",
-    ]
+    expected = format_interval(mean_interval(values(rows, own.labels, DENSITY)))
+    assert line_of(text, "9. `capped`, random walk, `round-robin` (4)")[1:3] == [expected, "-"]
     # Nor are labels of a part that was not played at all columns of the rows.
-    few = rows.filter(pl.col("cell") == priced("ekf").id)
+    few = rows.filter(pl.col("cell") == priced("random_walk").id)
     few = few.select(name for name in few.columns if not few[name].null_count())
     text = report(few, tmp_path)
     assert line_of(text, "1. `capped`, EKF, `shift-ahead` (1)")[1:] == ["-"] * 5
-    assert line_of(text, "EKF, nominal")[1] == "26.18 [24.44, 27.92]"
+    assert line_of(text, "random walk, nominal")[1] == "27.62 [26.08, 29.16]"
     assert not list(tmp_path.iterdir())
+
+
+def test_every_rung_differs_in_one_thing_from_the_one_that_it_is_held_against():
+    rungs = [BASE | changes for _, changes, _ in LADDER]
+    for number, (label, _, base) in enumerate(LADDER, 1):
+        assert label.startswith(f"{number}. ")
+        own, other = rungs[number - 1], rungs[base - 1]
+        assert sum(own[name] != other[name] for name in BASE) == (base != number), label
+
+
+def test_every_cell_has_the_shipped_settings_of_its_estimator_and_release_model():
+    for cell in all_cells():
+        estimator, release = cell.keywords["estimator"], cell.keywords["privacy"]["preset"]
+        if release.endswith(":Exact"):
+            release = "paced"
+        else:
+            assert "estimator_settings" not in cell.keywords
+        expected = None if estimator == "open_loop" else f"{estimator}-w99-3lane-{release}"
+        assert cell.config.settings_name == expected
 
 
 def test_epsilon_is_that_of_the_sums_of_two_vehicles():
