@@ -17,7 +17,6 @@ from dptse_env.evaluation import require_in_step
 from dptse_env.privacy import rounded_up
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.release import RELEASE_MODELS
-from dptse_env.traffic import Loops
 from dptse_env.utils.validation import parse_json, require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
@@ -135,7 +134,7 @@ def heading(env: str, keywords: Mapping[str, Any]) -> str:
     else:
         said += _differences("corridor", road.fields(), default.corridor.fields())
     if road.loops != default.corridor.loops:
-        said.append(f"loops {_in_words(road.loops)}")
+        said.append(str(road.loops or "no loops"))
     expected = RELEASE_MODELS.find(privacy.preset).settings_type(
         preset=privacy.preset, epsilon=privacy.epsilon, delta=privacy.delta
     )
@@ -148,18 +147,6 @@ def heading(env: str, keywords: Mapping[str, Any]) -> str:
             else:
                 said += _differences("", {name: own}, {name: other})
     return ", ".join(said)
-
-
-def _in_words(loops: Loops | None) -> str:
-    """Return stations, interval and least count; of many stations their number."""
-    if loops is None:
-        return "none"
-    stations = [f"{each:g} km" for each in loops.positions] + [f"ramp {r}" for r in loops.ramps]
-    words = ", ".join(stations)
-    if len(words) > LONGEST:
-        words = f"{len(stations)} stations"
-    least = f" (least count {loops.least_count})" if loops.least_count else ""
-    return f"at {words} every {loops.interval} s{least}"
 
 
 def _differences(path: str, own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:

@@ -119,12 +119,11 @@ class PrivacyReport:
     def beside(self, loops: Loops) -> PrivacyReport:
         """Return what the report states beside loops: the same, given their readings."""
         alone = f"; {ALONE}" if loops.least_count < 2 else ""
-        named = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(loops).items()}
         return replace(
             self,
             protects=f"{self.protects}, {GIVEN_LOOPS}{alone}",
             guarantee="none" if self.guarantee == "none" else f"{self.guarantee}, {GIVEN_LOOPS}",
-            details={**self.details, "loops": named},
+            details={**self.details, "loops": loops.fields()},
         )
 
     def voided(self, reasons: Iterable[str]) -> PrivacyReport:

@@ -210,11 +210,7 @@ def load_policy(
 def describe_road(corridor: Corridor) -> str:
     """Return the name and the sizes of a corridor in words."""
     length = min(corridor.geometry.segment_lengths[: corridor.geometry.n_mainline])
-    loops, beside = corridor.loops, ""
-    if loops is not None:
-        places = [*map("{:g}".format, loops.positions), *(f"ramp {face}" for face in loops.ramps)]
-        beside = f", loops at {', '.join(places)} every {loops.interval} s"
-        beside += f" (least count {loops.least_count})" if loops.least_count else ""
+    beside = "" if corridor.loops is None else f", {corridor.loops}"
     return (
         f"{corridor.name} ({corridor.geometry.n_mainline} mainline segments of {length:g} km, "
         f"{corridor.geometry.most_lanes} lanes, fixed sensors on {list(corridor.fixed_sensors)}"
@@ -237,9 +233,8 @@ def _fit(config: EnvConfig, name: str) -> dict[str, Any]:
         "bandwidth": config.bandwidth,
         "fixed_sensors": list(config.corridor.fixed_sensors),
     }
-    if (loops := config.corridor.loops) is not None:
-        places = {"positions": list(loops.positions), "ramps": list(loops.ramps)}
-        fit["loops"] = {**places, "interval": loops.interval, "least_count": loops.least_count}
+    if config.corridor.loops is not None:
+        fit["loops"] = config.corridor.loops.fields()
     if not config.queries.are_segments:
         fit["queries"] = f"{config.queries}, bandwidth_unit {config.bandwidth_unit!r}"
     if name == SHARED:

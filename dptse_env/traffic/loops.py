@@ -5,8 +5,8 @@ reports once an interval.
 """
 
 import warnings
-from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple, Self
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -54,6 +54,17 @@ class Loops:
         allowed = "not empty where no ramp has a station"
         some = bool(self.positions or self.ramps)
         require(some, "corridor.loops.positions", allowed, self.positions)
+
+    def __str__(self) -> str:
+        """Return the settings in words."""
+        places = [f"{position:g} km" for position in self.positions]
+        places += [f"ramp {face}" for face in self.ramps]
+        least = f" (least count {self.least_count})" if self.least_count else ""
+        return f"loops at {', '.join(places)} every {self.interval} s{least}"
+
+    def fields(self) -> dict[str, Any]:
+        """Return all fields by name, plain JSON."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     def at_borders(self, geometry: Geometry) -> Self:
         """Return these stations at borders of a road's segments.

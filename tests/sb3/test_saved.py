@@ -211,11 +211,11 @@ def test_the_card_describes_the_policy(stored):
         ({"corridor": {"fixed_sensors": [7]}}, r"sensors on \[5, 7\]\), .* sensors on \[7\]\)"),
         (
             {"loops": {"positions": [0.2], "ramps": [4]}},
-            r"sensors on \[5, 7\]\), .* sensors on \[5, 7\], loops at 0.2, ramp 4 every 20 s\)",
+            r"sensors on \[5, 7\]\), .* sensors on \[5, 7\], loops at 0.2 km, ramp 4 every 20 s\)",
         ),
         (
             {"loops": {"positions": [0.2], "least_count": 5}},
-            r"loops at 0.2 every 20 s \(least count 5\)\), traffic",
+            r"loops at 0.2 km every 20 s \(least count 5\)\), traffic",
         ),
     ],
 )
@@ -231,7 +231,7 @@ def test_a_policy_that_was_trained_beside_other_loops_is_refused(path):
     load_policy(path, make_env(loops=trained))
     for other in ({"positions": [0.2, 0.5]}, {"interval": 240}, {"least_count": 5}):
         env = make_env(loops=trained | other)
-        with pytest.raises(ValueError, match=r"corridor is .* loops at 0\.2, 0\.4 every"):
+        with pytest.raises(ValueError, match=r"corridor is .* loops at 0\.2 km, 0\.4 km every"):
             load_policy(path, env)
         load_policy(path, env, allow=["corridor"])
 
