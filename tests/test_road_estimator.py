@@ -306,6 +306,12 @@ def test_a_restart_gives_the_same_bits(estimator):
     assert (bits(road, LONGEST) == bits(again, LONGEST)).all()
 
 
+def test_a_filter_restarts_that_never_observed_some_segments():
+    road, again = (make("ekf", estimator_settings={"flicker": True}) for _ in range(2))
+    again.load(played(road, 70).save())
+    assert (bits(played(road, 130)) == bits(played(again, 130))).all()
+
+
 def test_a_state_is_saved_ahead_of_the_first_step():
     road, again = make(), make(start=7)
     again.load(road.save())

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
+from dptse_env.estimators.flicker import Flicker
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
@@ -167,6 +168,8 @@ class Estimator(ABC):
     """True where its settings may ask for demand states."""
     steps_model: ClassVar[bool] = True
     """True where it steps the model, whose time step then must satisfy the CFL condition."""
+    reads_flicker: ClassVar[bool] = False
+    """True where its settings may ask for flicker, which `_flickering` then adds."""
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: Any) -> None:
         """See `make_estimator`."""
@@ -177,6 +180,8 @@ class Estimator(ABC):
         self._noise_scale = None if (scale == 1.0).all() else scale
         cap = getattr(settings, "speed_cap", None)
         self._largest_speed = None if cap is None else cap * model.road.limits[: model.n_segments]
+        asks = self.reads_flicker and settings.flicker
+        self._flicker = Flicker(model, n_episodes) if asks else None
         self.innovations = np.zeros((n_episodes, model.channels.size, 2))
         self.diverged = np.zeros(n_episodes, dtype=np.bool_)
         self.fallback = np.zeros(n_episodes, dtype=np.bool_)
@@ -224,6 +229,8 @@ class Estimator(ABC):
         self.innovations[episodes] = 0.0
         self.diverged[episodes] = False
         self.fallback[episodes] = False
+        if self._flicker is not None:
+            self._flicker.reset(episodes)
         self._reset(episodes, states, generators)
 
     def predict(self, episodes: IntArray, inputs: FloatArray) -> None:
@@ -266,7 +273,8 @@ class Estimator(ABC):
         Raises:
             ValueError: The estimator does not say what it remembers.
         """
-        return (*self._memory, self.innovations, self.diverged, self.fallback)
+        since = () if self._flicker is None else (self._flicker.since,)
+        return (*self._memory, *since, self.innovations, self.diverged, self.fallback)
 
     @property
     def _memory(self) -> tuple[AnyArray, ...]:
@@ -299,8 +307,8 @@ class Estimator(ABC):
             elif id(own) in limits:
                 low, high = limits[id(own)]
                 allowed, wrong = f"in {low:g}..{high:g}", (numbers < low) | (numbers > high)
-            if wrong.any():
-                require(False, f"memory[{i}]", allowed, numbers[wrong][0].item())
+            first = next(iter(numbers[wrong].tolist()), None)
+            require(first is None, f"memory[{i}]", allowed, first)
 
     @abstractmethod
     def _reset(
@@ -312,6 +320,18 @@ class Estimator(ABC):
 
     @abstractmethod
     def _update(self, episodes: IntArray, measured: Measurement) -> None: ...
+
+    def _flickering(self, episodes: IntArray, measured: Measurement) -> Measurement:
+        """Return what was measured with the deviations of flicker, where settings ask for it."""
+        if self._flicker is None:
+            return measured
+        means, (observed, _, sigma, centre) = self._means_of(episodes), measured
+        sigma = self._flicker.deviations(episodes, means, observed, centre, sigma)
+        return measured._replace(sigma=sigma)
+
+    def _means_of(self, episodes: IntArray) -> FloatArray:
+        """Return means `(k, n_x)` [veh/km, veh/h], of an estimator that reads flicker."""
+        raise NotImplementedError
 
     @abstractmethod
     def _estimate(self) -> Estimate:
@@ -358,7 +378,7 @@ class KernelEstimator(Estimator):
         self.predict_kernel(self.arrays, episodes, inputs)
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        self.update_kernel(self.arrays, episodes, measured)
+        self.update_kernel(self.arrays, episodes, self._flickering(episodes, measured))
 
 
 class SegmentEstimator(KernelEstimator):

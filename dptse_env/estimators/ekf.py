@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from dptse_env.estimators.base import Estimate, KernelEstimator, Measurement
-from dptse_env.estimators.flicker import Flicker
 from dptse_env.estimators.linalg import is_covariance, mirror, padded, pair_update, propagate
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
@@ -64,6 +63,8 @@ class CovarianceFilter(KernelEstimator):
         filters: These arrays, which predictions and updates change in place.
     """
 
+    reads_flicker = True
+
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
@@ -82,7 +83,6 @@ class CovarianceFilter(KernelEstimator):
             is_box=settings.bounds == "box",
         )
         self.arrays = self._moments = Bundle(*model.dynamics, self.filters)
-        self._flicker = Flicker(model, n_episodes) if settings.flicker else None
         for episode in range(n_episodes):
             restart(self.filters, episode)
 
@@ -99,8 +99,7 @@ class CovarianceFilter(KernelEstimator):
 
     @property
     def _memory(self) -> tuple[AnyArray, ...]:
-        since = () if self._flicker is None else (self._flicker.since,)
-        return self.filters.means, self.filters.covariances, self.filters.priors, *since
+        return self.filters.means, self.filters.covariances, self.filters.priors
 
     def _estimate(self) -> Estimate:
         out = np.empty((4, self.n_episodes, self.model.n_segments))
@@ -112,13 +111,9 @@ class CovarianceFilter(KernelEstimator):
     ) -> None:
         self.filters.priors[episodes] = self.model.project(states, self.settings.bounds)
         self._restart(episodes)
-        if self._flicker is not None:
-            self._flicker.reset(episodes)
 
-    def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        if self._flicker is not None:
-            measured = self._flicker.added(episodes, measured, self.filters.means[episodes])
-        super()._update(episodes, measured)
+    def _means_of(self, episodes: IntArray) -> FloatArray:
+        return self.filters.means[episodes]
 
     def _restart(self, episodes: IntArray) -> None:
         """Reset episodes to their priors."""

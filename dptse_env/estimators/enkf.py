@@ -18,7 +18,6 @@ from dptse_env.estimators.ekf import (
     initial_variance,
     process_variance,
 )
-from dptse_env.estimators.flicker import Flicker
 from dptse_env.estimators.linalg import factor, padded, solve_many
 from dptse_env.estimators.normals import STREAM_WIDTH, Draws, draw, make_stream
 from dptse_env.estimators.settings import EstimatorSettings
@@ -391,6 +390,7 @@ class EnKF(KernelEstimator):
     ensemble's mean for all members.
     """
 
+    reads_flicker = True
     predict_kernel = staticmethod(predict)
     update_kernel = staticmethod(update)
 
@@ -419,7 +419,6 @@ class EnKF(KernelEstimator):
             is_box=settings.bounds == "box",
         )
         self.arrays = Bundle(*model.dynamics, self._ensembles)
-        self._flicker = Flicker(model, n_episodes) if settings.flicker else None
         self._seed(np.arange(n_episodes), [np.random.default_rng(0)] * n_episodes)
 
     @property
@@ -447,9 +446,7 @@ class EnKF(KernelEstimator):
 
     @property
     def _memory(self) -> tuple[AnyArray, ...]:
-        since = () if self._flicker is None else (self._flicker.since,)
-        ensembles = self._ensembles
-        return ensembles.members, ensembles.priors, ensembles.streams, *since
+        return self._ensembles.members, self._ensembles.priors, self._ensembles.streams
 
     def _reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]
@@ -457,14 +454,9 @@ class EnKF(KernelEstimator):
         self._ensembles.priors[episodes] = self.model.project(states, self.settings.bounds)
         self._seed(episodes, generators)
         restart(self.arrays, episodes)
-        if self._flicker is not None:
-            self._flicker.reset(episodes)
 
-    def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        if self._flicker is not None:
-            means = self._inner[episodes].mean(axis=2)
-            measured = self._flicker.added(episodes, measured, means)
-        super()._update(episodes, measured)
+    def _means_of(self, episodes: IntArray) -> FloatArray:
+        return np.asarray(self._inner[episodes].mean(axis=2))
 
     def _seed(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
         """Seed the streams of process noise and of measurement noise."""

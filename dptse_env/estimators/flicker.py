@@ -18,7 +18,6 @@ at 65 and .1 at 100; s is 9 to 15 km/h. The autocorrelation over a lag of d is n
 
 import numpy as np
 
-from dptse_env.estimators.base import Measurement
 from dptse_env.model import ARZModel
 from dptse_env.model.parameters import VACUUM
 from dptse_env.model.step import pressure
@@ -34,6 +33,8 @@ ROUNDING = 1.0 / 12.0
 """Variance of the rounding to whole vehicles."""
 LEAST_SPEED = 5.0
 """Speed from which on the time on a segment does not grow any more [km/h]."""
+NEVER = 1e9
+"""Seconds since what was never observed."""
 
 
 class Flicker:
@@ -45,27 +46,35 @@ class Flicker:
 
     def __init__(self, model: ARZModel, n_episodes: int) -> None:
         """Prepare for the channels of a model."""
-        self.since = np.full((n_episodes, model.channels.size), np.inf)
+        self.since = np.full((n_episodes, model.channels.size), NEVER)
         self._time_step = model.time_step
         self._bundle = Bundle(model.arz, model.channels)
 
     def reset(self, episodes: IntArray) -> None:
         """Forget what was observed of episodes (k,)."""
-        self.since[episodes] = np.inf
+        self.since[episodes] = NEVER
 
-    def added(self, episodes: IntArray, measured: Measurement, states: FloatArray) -> Measurement:
-        """Return what was measured of a second of episodes (k,) with the deviations of flicker.
+    def deviations(
+        self,
+        episodes: IntArray,
+        states: FloatArray,
+        observed: BoolArray,
+        centre: FloatArray,
+        sigma: FloatArray,
+    ) -> FloatArray:
+        """Return the deviations of a measurement of episodes (k,) with those of flicker.
 
         Args:
             episodes: Distinct indices.
-            measured: The measurement.
             states: Predicted means, (k, n_x) [veh/km, veh/h].
+            observed: See `dptse_env.estimators.Measurement`.
+            centre: See there.
+            sigma: See there.
         """
-        since = self.since[episodes] + self._time_step
-        sigma = measured.sigma.copy()
-        add(self._bundle, states, measured.observed, measured.centre, since, sigma)
+        since, sigma = self.since[episodes] + self._time_step, sigma.copy()
+        add(self._bundle, states, observed, centre, since, sigma)
         self.since[episodes] = since
-        return measured._replace(sigma=sigma)
+        return sigma
 
 
 @kernel

@@ -20,7 +20,6 @@ from scipy.sparse.linalg import splu
 from dptse_env.estimators.base import Estimate, Estimator, Measurement, estimated_traffic
 from dptse_env.estimators.ekf import initial_variance, process_variance
 from dptse_env.estimators.enkf import make_tapers
-from dptse_env.estimators.flicker import Flicker
 from dptse_env.estimators.mhe import (
     LEAST_DEVIATION,
     moving_variance,
@@ -175,6 +174,7 @@ class ReferenceFilter(Estimator):
         filters: The filter of each episode.
     """
 
+    reads_flicker = True
     _filter_type: ClassVar[type[Any]]
 
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
@@ -182,7 +182,6 @@ class ReferenceFilter(Estimator):
         super().__init__(model, n_episodes, settings)
         problem = Problem(model, settings)
         self.filters = [self._filter_type(problem) for _ in range(n_episodes)]
-        self._flicker = Flicker(model, n_episodes) if settings.flicker else None
         nothing = np.zeros((n_episodes, model.n_segments))
         states = model.compose(nothing, nothing)
         self._reset(np.arange(n_episodes), states, [np.random.default_rng(0)] * n_episodes)
@@ -213,8 +212,6 @@ class ReferenceFilter(Estimator):
         means = self.model.project(states, self.settings.bounds) / self.model.state_scale
         for episode, mean, generator in zip(episodes.tolist(), means, generators, strict=True):
             self.filters[episode].reset(mean, generator)
-        if self._flicker is not None:
-            self._flicker.reset(episodes)
 
     def _predict(self, episodes: IntArray, inputs: FloatArray) -> None:
         with np.errstate(all="ignore"):  # the update detects overflows
@@ -225,12 +222,14 @@ class ReferenceFilter(Estimator):
                     self.filters[episode].x[:] = np.nan
 
     def _update(self, episodes: IntArray, measured: Measurement) -> None:
-        if self._flicker is not None:
-            measured = self._flicker.added(episodes, measured, self.states[episodes])
+        measured = self._flickering(episodes, measured)
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("error", LinAlgWarning)
             for k, episode in enumerate(episodes.tolist()):
                 self._update_one(episode, measured.at(k))
+
+    def _means_of(self, episodes: IntArray) -> FloatArray:
+        return self.states[episodes]
 
     def _update_one(self, episode: int, seen: Measurement) -> None:
         each, innovations = self.filters[episode], np.zeros_like(self.innovations[episode])

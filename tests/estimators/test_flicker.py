@@ -32,10 +32,9 @@ def deviations(model, states, since=(), sigma=0.0, centre=None):
     seen = [each for gap in since for each in (every, *[nothing] * (gap - 1))]
     for observed in (*seen, every):
         measured = Measurement.of(model, observed, values, sigma, around)
-        found = flicker.added(ONE, measured, states)
-        np.testing.assert_array_equal(found.values, measured.values)
-        np.testing.assert_array_equal(found.sigma[~observed], sigma[~observed])
-    return found.sigma[0]
+        found = flicker.deviations(ONE, states, observed, measured.centre, sigma)
+        np.testing.assert_array_equal(found[~observed], sigma[~observed])
+    return found[0]
 
 
 def uniform(model, density, speed):
@@ -111,10 +110,11 @@ def test_a_reset_forgets_when_channels_were_observed():
     model, everything = model_of("w99-3lane", "speed"), np.ones((2, 19), bool)
     flicker, states = Flicker(model, 2), np.repeat(uniform(model, 30.0, 60.0), 2, axis=0)
     measured = Measurement.of(model, everything, np.zeros((2, 19, 2)), np.zeros((2, 19, 2)))
-    first, later = (flicker.added(np.arange(2), measured, states).sigma for _ in range(2))
+    seen = np.arange(2), states, everything, measured.centre, measured.sigma
+    first, later = (flicker.deviations(*seen) for _ in range(2))
     assert (later > 1.5 * first).all()
     flicker.reset(np.array([1]))
-    last = flicker.added(np.arange(2), measured, states).sigma
+    last = flicker.deviations(*seen)
     np.testing.assert_array_equal(last, np.stack([later[0], first[1]]))
 
 
