@@ -69,9 +69,8 @@ class History:
         title = (
             f"{corridor.name}, estimator {estimator}, queries {config.bandwidth} {unit} a second"
         )
-        scale, loops = corridor.scales.density_scale, ()
-        if process.loops is not None:
-            loops = tuple(process.loops.stations.positions.tolist())
+        scale = corridor.scales.density_scale
+        loops = tuple(corridor.stations.positions.tolist())
         return cls(episode, config.horizon_steps, lengths, scale, title=title, loops=loops)
 
     @property

@@ -19,13 +19,12 @@ import numpy as np
 
 from dptse_env.config import resolve
 from dptse_env.estimators import Estimate, Measurement, make_estimator
-from dptse_env.geometry import Geometry
 from dptse_env.measurement import nominal_state
 from dptse_env.measurement.boundary import nominal_inputs
 from dptse_env.measurement.loops import UNKNOWN, interpreted, seconds_told
 from dptse_env.measurement.seen import LONGEST, Seen
 from dptse_env.parts import make_model
-from dptse_env.traffic.loops import TOLERANCE
+from dptse_env.traffic.loops import TOLERANCE, borders_of
 from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
 from dptse_env.utils.files import dump_tensors, json_digest, parse_tensors, require_arrays
 from dptse_env.utils.registry import name_of_class
@@ -113,7 +112,11 @@ class RoadEstimator:
         keywords = {**_NO_QUERIES, "corridor": road, "estimator": estimator, **given}
         config = resolve("private-highway", keywords)
         self.corridor, self.model = config.corridor, make_model(config)
-        self._borders = dict(_borders(self.corridor.geometry))
+        geometry = self.corridor.geometry
+        # The mainline (None) and each ramp, by face: its first segment, its borders [km].
+        self._borders: dict[int | None, tuple[int, FloatArray]] = {None: (0, borders_of(geometry))}
+        for face, _, segments in geometry.ramps():
+            self._borders[face] = segments[0], borders_of(geometry, segments)
         settings = config.settings()
         if stations is None:
             stations = () if self.corridor.loops is None else self.corridor.loops.positions
@@ -407,15 +410,6 @@ class RoadEstimator:
         fits = list(places) == sorted(set(places)) and all(0.0 <= x <= length for x in places)
         require(fits, "stations", allowed, places)
         return (places[-1] - places[0]) / (len(places) - 1) if len(places) > 1 else 0.0
-
-
-def _borders(geometry: Geometry) -> Iterator[tuple[int | None, tuple[int, FloatArray]]]:
-    """Yield the mainline (None) and each ramp, by face: its first segment, its borders [km]."""
-    lengths = np.array(geometry.segment_lengths)
-    ramps = [(face, segments) for face, _, segments in geometry.ramps()]
-    for face, segments in [(None, tuple(range(geometry.n_mainline))), *ramps]:
-        ends = np.cumsum(lengths[list(segments)])
-        yield face, (segments[0], np.round(np.concatenate([[0.0], ends]), 9))
 
 
 def _as_bytes(arrays: Sequence[AnyArray]) -> dict[str, AnyArray]:

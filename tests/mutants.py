@@ -727,9 +727,10 @@ MUTANTS = (
     # --- loops ----------------------------------------------------------------------------------
     Mutant(
         "loops leave out a vehicle that is not connected", 25, "release/vehicles.py",
-        "readings(record, self._stations",
+        "readings(record, self.corridor.stations",
         "readings(record.without(int(np.argmin(self.populations[0].connected(self.seeds[index], "
-        "record)))) if self.populations and self.populations[0] else record, self._stations",
+        "record)))) if self.populations and self.populations[0] else record, "
+        "self.corridor.stations",
         "test_non_interference.py",
     ),
     Mutant(
@@ -751,9 +752,8 @@ MUTANTS = (
     Mutant(
         "an observation has the reading of an interval that has not ended", 25,
         "measurement/loops.py",
-        "some = np.full((len(times), len(self.stations.beside), 2), np.nan), interval >= 0",
-        "some = np.full((len(times), len(self.stations.beside), 2), np.nan), interval > -2; "
-        "interval = np.minimum(interval + 1, 5)",
+        "self._traffic.readings.shape[2], interval >= 0",
+        "self._traffic.readings.shape[2], interval > -2; interval = np.minimum(interval + 1, 5)",
         "test_non_interference.py",
     ),
     Mutant(

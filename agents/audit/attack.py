@@ -18,7 +18,7 @@ from dptse_env.parts import make_release, make_traffic
 from dptse_env.process import QueryProcess
 from dptse_env.release import GaussianRelease, ReleaseModel, Request
 from dptse_env.release.noise import Noise
-from dptse_env.traffic import Stations, readings
+from dptse_env.traffic import readings
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 
 BATCH = 250
@@ -86,8 +86,7 @@ class Overheard(ReleaseModel):
         corridor = config.corridor
         if corridor.loops is not None:
             # The guarantee is one given the readings: worlds differ in reports, not in what drives.
-            stations = Stations.of(corridor.loops, corridor.geometry)
-            traffic.readings[:] = readings(worlds.rest, stations, corridor.loops)
+            traffic.readings[:] = readings(worlds.rest, corridor.stations, corridor.loops)
         self.model = make_release(config, n, traffic)
         super().__init__(self.model.task, traffic)
         # Every run in both worlds, whichever it is in.

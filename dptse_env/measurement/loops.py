@@ -12,7 +12,6 @@ import numpy as np
 
 from dptse_env.estimators import Measurement
 from dptse_env.release import Task, Traffic
-from dptse_env.traffic import Stations
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, kernel
 from dptse_env.utils.units import HOUR, KMH
@@ -139,7 +138,6 @@ class LoopReadings:
 
     Attributes:
         interval: Length of an interval [s].
-        stations: The F stations.
     """
 
     def __init__(self, task: Task, traffic: Traffic) -> None:
@@ -148,8 +146,8 @@ class LoopReadings:
         assert corridor.loops is not None
         self._traffic, road = traffic, corridor.road
         self.interval = corridor.loops.interval
-        self.stations = Stations.of(corridor.loops, corridor.geometry)
-        segments, place = np.unique(self.stations.beside, return_inverse=True)
+        beside = corridor.stations.beside
+        segments, place = np.unique(beside, return_inverse=True)
         channels = task.queries.channels_of_segments(corridor)[segments]
         least_density = 1.0 / road.lengths[segments]
         self._places = Bundle(Places(channels, segments, least_density, task.releases_flow))
@@ -161,7 +159,7 @@ class LoopReadings:
         self._said = np.empty((*traffic.readings.shape[:2], segments.size, 4))
         self._loaded = np.zeros(len(traffic.seeds), dtype=bool)
         # Pairs of a station and a segment beside it.
-        pairs = np.arange(len(self.stations.beside)).repeat(2), place.reshape(-1)
+        pairs = np.arange(len(beside)).repeat(2), place.reshape(-1)
         self._station, self._place = np.unique(np.array(pairs), axis=1)
         beside = segments[self._place]
         on_ramp = beside >= road.n_mainline
@@ -176,7 +174,8 @@ class LoopReadings:
     def last(self, traffic: IntArray, times: IntArray) -> FloatArray:
         """Return last readings (k, F, 2) at seconds of the record (k,), NaN before the first."""
         interval = times // self.interval - 1
-        found, some = np.full((len(times), len(self.stations.beside), 2), np.nan), interval >= 0
+        n_stations, some = self._traffic.readings.shape[2], interval >= 0
+        found = np.full((len(times), n_stations, 2), np.nan)
         found[some] = self.read(traffic[some], interval[some])
         return found
 

@@ -30,7 +30,6 @@ from dptse_env.traffic import (
     Penetration,
     Record,
     RecordLibrary,
-    Stations,
     readings,
 )
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -102,11 +101,9 @@ class Traffic:
         self._cell: NDArray[np.int16] = np.empty(0, dtype=np.int16)
         self._speed: NDArray[np.float32] = np.empty((len(self.populations), 0), dtype=np.float32)
         self._n_rows = 0
-        self.readings: FloatArray = np.empty((len(seeds), 0, 0, 2))
-        if (loops := corridor.loops) is not None:
-            self._stations = Stations.of(loops, corridor.geometry)
-            shape = corridor.conditions.duration // loops.interval, len(self._stations.beside), 2
-            self.readings = np.empty((len(seeds), *shape))
+        loops, n_stations = corridor.loops, len(corridor.stations.positions)
+        n_intervals = 0 if loops is None else corridor.conditions.duration // loops.interval
+        self.readings: FloatArray = np.empty((len(seeds), n_intervals, n_stations, 2))
 
     def load(self, indices: npt.ArrayLike) -> list[int]:
         """Load the records of some traffic seeds; return the indices that were not in memory.
@@ -124,8 +121,8 @@ class Traffic:
             self._table[index] = record.traffic(road.lengths, road.limits)
             if self.populations:
                 self._append(index, record)
-            if self.corridor.loops is not None:
-                self.readings[index] = readings(record, self._stations, self.corridor.loops)
+            if (loops := self.corridor.loops) is not None:
+                self.readings[index] = readings(record, self.corridor.stations, loops)
             self._loaded[index] = True
         return new
 

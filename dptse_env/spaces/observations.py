@@ -19,7 +19,7 @@ from gymnasium import spaces
 
 from dptse_env.estimators import Estimate
 from dptse_env.release import Task
-from dptse_env.traffic.loops import Stations, borders_of
+from dptse_env.traffic.loops import borders_of
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
 from dptse_env.utils.units import HOUR
@@ -170,14 +170,8 @@ def _of_sensors(component: int) -> Callable[[Task], Any]:
     return lambda task: (slice(None), task.sensors, component)
 
 
-def _stations(task: Task) -> Stations | None:
-    loops, geometry = task.corridor.loops, task.corridor.geometry
-    return None if loops is None else Stations.of(loops, geometry)
-
-
 def _loops(task: Task) -> int:
-    stations = _stations(task)
-    return 0 if stations is None else len(stations.positions)
+    return len(task.corridor.stations.positions)
 
 
 def _interval(task: Task) -> int:
@@ -189,8 +183,8 @@ def _has_loops(task: Task, _: bool) -> bool:
 
 
 def _places(task: Task) -> FloatArray:
-    stations, geometry = _stations(task), task.corridor.geometry
-    return np.zeros(0) if stations is None else stations.positions / borders_of(geometry)[-1]
+    length = float(borders_of(task.corridor.geometry)[-1])
+    return task.corridor.stations.positions / length
 
 
 def _known(values: FloatArray, unit: float) -> FloatArray:

@@ -22,7 +22,7 @@ from dptse_env.traffic.demand import (
     IncidentDistribution,
     VehicleClass,
 )
-from dptse_env.traffic.loops import Loops
+from dptse_env.traffic.loops import Loops, Stations
 from dptse_env.traffic.own_sumo import SumoScenario
 from dptse_env.utils.files import json_digest
 from dptse_env.utils.units import HOUR
@@ -309,6 +309,11 @@ class Corridor:
     def road(self) -> Road:
         """The geometry as arrays."""
         return make_road(self.geometry)
+
+    @cached_property
+    def stations(self) -> Stations:
+        """The stations of its loops."""
+        return Stations.of(self.loops, self.geometry)
 
     @property
     def record_shape(self) -> tuple[int, int]:

@@ -5,6 +5,7 @@ reports once an interval.
 """
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any, NamedTuple, Self
 
@@ -105,10 +106,11 @@ class Loops:
         return faces
 
 
-def borders_of(geometry: Geometry) -> FloatArray:
-    """Return the positions of the borders of mainline segments, (N + 1,) [km]."""
-    lengths = geometry.segment_lengths[: geometry.n_mainline]
-    return np.round(np.concatenate([[0.0], np.cumsum(lengths)]), 9)
+def borders_of(geometry: Geometry, segments: Sequence[int] | None = None) -> FloatArray:
+    """Return the positions of the borders of segments, by default the mainline's, (N + 1,) [km]."""
+    lengths = np.array(geometry.segment_lengths)
+    ends = np.cumsum(lengths[: geometry.n_mainline] if segments is None else lengths[[*segments]])
+    return np.round(np.concatenate([[0.0], ends]), 9)
 
 
 class Stations(NamedTuple):
@@ -130,8 +132,8 @@ class Stations(NamedTuple):
     positions: FloatArray  # (F,) along the mainline [km]; of a ramp where it meets it
 
     @classmethod
-    def of(cls, loops: Loops, geometry: Geometry) -> Self:
-        """Return the stations of loops at borders."""
+    def of(cls, loops: Loops | None, geometry: Geometry) -> Self:
+        """Return the stations of loops at borders; none without loops."""
         n, S, cells = geometry.n_mainline, geometry.n_segments, geometry.n_cells
         # Mainline faces up to these lie behind a cell, and those from there on ahead of it.
         behind, ahead = np.full(cells, -1), np.full(cells, n + 1)
@@ -145,10 +147,10 @@ class Stations(NamedTuple):
             is_on_ramp = ramp < len(geometry.on_ramps)
             # Nobody drives back onto a ramp, or from an off-ramp onto the road.
             (ahead if is_on_ramp else behind)[own] = face if is_on_ramp else face - 1
-            if face in loops.ramps:
+            if loops is not None and face in loops.ramps:
                 ramps.append((face, own, is_on_ramp, segments[-1 if is_on_ramp else 0]))
         upstream, downstream, beside = [], [], []
-        faces = loops.faces(geometry).tolist()
+        faces = [] if loops is None else loops.faces(geometry).tolist()
         for face in faces:
             upstream.append(ahead <= face)
             downstream.append(behind >= face)
@@ -161,8 +163,8 @@ class Stations(NamedTuple):
             beside.append((end, end))
         ends = np.array([*faces, *(-1 for _ in ramps)])
         return cls(
-            np.array(upstream),
-            np.array(downstream),
+            np.array(upstream, dtype=bool).reshape(-1, cells),
+            np.array(downstream, dtype=bool).reshape(-1, cells),
             np.array(beside, dtype=np.int64).reshape(-1, 2),
             np.where(ends == 0, 0, -1),
             np.where(ends == n, n - 1, -1),

@@ -9,7 +9,7 @@ from agents.audit.attack import make_overheard
 from agents.audit.planner import Planner
 from agents.audit.report import audit_environment, audit_one_run
 from agents.audit.worlds import Trajectory, Worlds
-from dptse_env.traffic import Loops, Stations, readings
+from dptse_env.traffic import Loops, readings
 
 from . import small
 
@@ -22,11 +22,10 @@ def beside_loops(setting):
 
 def passing(record):
     """Worlds with and without a vehicle that passes the loop."""
-    stations = Stations.of(ROAD.loops, ROAD.geometry)
-    table = readings(record, stations, ROAD.loops)
+    table = readings(record, ROAD.stations, ROAD.loops)
     for vehicle in range(record.n_vehicles):
         rest = record.without(vehicle)
-        if not np.array_equal(readings(rest, stations, ROAD.loops), table, equal_nan=True):
+        if not np.array_equal(readings(rest, ROAD.stations, ROAD.loops), table, equal_nan=True):
             pair = Trajectory.from_record(record, vehicle), Trajectory.absent()
             return Worlds.adjacent(rest, pair)
     raise AssertionError("nobody passes the loop")
