@@ -207,9 +207,6 @@ class QueryProcess:
         for_traffic, for_noise, for_estimator, for_detectors = zip(*streams, strict=True)
         traffic, starts = draw_traffic(fixed, self.config, for_traffic)
         self.traffic.load(traffic)
-        self.boundary.load(traffic)
-        if self.loops is not None:
-            self.loops.load(traffic)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
         self.start[episodes] = starts
         self.pending.reset(episodes)

@@ -39,9 +39,6 @@ class BoundaryModel(ABC):
     def inputs(self, episodes: IntArray, traffic: IntArray, times: IntArray) -> FloatArray:
         """Return inputs (k, n_u) of episodes (k,), by index of the traffic seed and second (k,)."""
 
-    def load(self, indices: IntArray) -> None:  # noqa: B027 (nothing by default)
-        """Prepare for the traffic of some indices, which the traffic table has loaded."""
-
     def reset(self, episodes: IntArray) -> None:  # noqa: B027 (nothing by default)
         """Begin new episodes, shape (k,)."""
 
@@ -57,23 +54,18 @@ class TrueBoundary(BoundaryModel):
     def __init__(self, task: Task, traffic: Traffic, model: ARZModel) -> None:
         """Prepare a table for all traffic seeds."""
         super().__init__(task, traffic, model)
-        # np.empty takes address space, not memory, until traffic is loaded.
-        self._table = np.empty(
-            (len(traffic.seeds), task.corridor.conditions.duration + 1, model.n_inputs)
-        )
-        self._loaded = np.zeros(len(traffic.seeds), dtype=bool)
+        shape = task.corridor.conditions.duration + 1, model.n_inputs
+        self._table = traffic.derived(shape, self._inputs_of)
 
     @property
     def shared(self) -> tuple[FloatArray, ...]:
         """The inputs of all traffic."""
         return (self._table,)
 
-    def load(self, indices: IntArray) -> None:
-        """Compute the inputs of complete records, of each once."""
-        for index in np.unique(indices[~self._loaded[indices]]).tolist():
-            traffic = self.traffic.complete(index)[:, self.model.n_segments :]
-            self._table[index] = self.model.boundary_inputs(traffic[..., 0], traffic[..., 1])
-            self._loaded[index] = True
+    def _inputs_of(self, index: int) -> FloatArray:
+        """Return the inputs of a complete record."""
+        traffic = self.traffic.complete(index)[:, self.model.n_segments :]
+        return self.model.boundary_inputs(traffic[..., 0], traffic[..., 1])
 
     def inputs(self, episodes: IntArray, traffic: IntArray, times: IntArray) -> FloatArray:
         """Return the true inputs."""

@@ -155,9 +155,6 @@ class LoopReadings:
         told = seconds_told(self.interval)
         self._tells = np.isin(np.arange(self.interval), told)
         self._n_told = len(told)
-        # np.empty takes address space, not memory, until traffic is loaded.
-        self._said = np.empty((*traffic.readings.shape[:2], segments.size, 4))
-        self._loaded = np.zeros(len(traffic.seeds), dtype=bool)
         # Pairs of a station and a segment beside it.
         pairs = np.arange(len(beside)).repeat(2), place.reshape(-1)
         self._station, self._place = np.unique(np.array(pairs), axis=1)
@@ -165,6 +162,8 @@ class LoopReadings:
         on_ramp = beside >= road.n_mainline
         self._pairs = road.lanes[beside], road.lengths[beside], road.limits[beside], on_ramp
         self._mean = np.eye(segments.size)[self._place]  # (pairs, L)
+        shape = traffic.readings.shape[1], segments.size, 4
+        self._said = traffic.derived(shape, self._said_of)
 
     def read(self, traffic: IntArray, interval: IntArray) -> FloatArray:
         """Return readings (k, F, 2) of intervals, from 0 on, of traffic seeds by index, (k,)."""
@@ -203,14 +202,13 @@ class LoopReadings:
         means: FloatArray = np.where(n > 0.0, total, np.nan) / np.maximum(n, 1.0)
         return means
 
-    def load(self, indices: IntArray) -> None:
-        """Make what is said in all intervals, of traffic that is loaded, once."""
-        for index in np.unique(indices[~self._loaded[indices]]).tolist():
-            said = self.said(self._traffic.readings[index])
-            more = self._n_told**0.5  # the errors of an interval are alike
-            density_std, speed_std = more * said.density_std, more * said.speed_std
-            self._said[index] = np.stack([said.density, said.speed, density_std, speed_std], -1)
-            self._loaded[index] = True
+    def _said_of(self, index: int) -> FloatArray:
+        """Return what is said in all intervals of a record, (K, L, 4)."""
+        said = self.said(self._traffic.readings[index])
+        more = self._n_told**0.5  # the errors of an interval are alike
+        return np.stack(
+            [said.density, said.speed, more * said.density_std, more * said.speed_std], -1
+        )
 
     def said_until(self, traffic: IntArray, times: IntArray) -> FloatArray:
         """Return what is said of the intervals that end at seconds (k,), each time it is told.

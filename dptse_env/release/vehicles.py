@@ -15,7 +15,7 @@ observed steps.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -101,12 +101,29 @@ class Traffic:
         self._cell: NDArray[np.int16] = np.empty(0, dtype=np.int16)
         self._speed: NDArray[np.float32] = np.empty((len(self.populations), 0), dtype=np.float32)
         self._n_rows = 0
+        self._derived: list[tuple[FloatArray, Callable[[int], FloatArray]]] = []
         loops, n_stations = corridor.loops, len(corridor.stations.positions)
         n_intervals = 0 if loops is None else corridor.conditions.duration // loops.interval
         self.readings: FloatArray = np.empty((len(seeds), n_intervals, n_stations, 2))
 
-    def load(self, indices: npt.ArrayLike) -> list[int]:
-        """Load the records of some traffic seeds; return the indices that were not in memory.
+    def derived(self, shape: tuple[int, ...], of: Callable[[int], FloatArray]) -> FloatArray:
+        """Return a table of what follows from each record, shape (n_seeds, *shape).
+
+        It has the rows of what is loaded, and `load` writes the others.
+
+        Args:
+            shape: Shape of a row.
+            of: Returns the row of a record by its index.
+        """
+        # np.empty takes address space, not memory, until a record is written.
+        table = np.empty((len(self.seeds), *shape))
+        for index in np.flatnonzero(self._loaded).tolist():
+            table[index] = of(index)
+        self._derived.append((table, of))
+        return table
+
+    def load(self, indices: npt.ArrayLike) -> None:
+        """Load the records of some traffic seeds that are not in memory.
 
         Records that are missing on disk are made, on all cores where there are several.
 
@@ -123,8 +140,9 @@ class Traffic:
                 self._append(index, record)
             if (loops := self.corridor.loops) is not None:
                 self.readings[index] = readings(record, self.corridor.stations, loops)
+            for table, of in self._derived:
+                table[index] = of(index)
             self._loaded[index] = True
-        return new
 
     def record(self, index: int) -> Record:
         """Return the record of ``seeds[index]``, which is made now if it is missing."""

@@ -36,7 +36,6 @@ def make(kind, preset="capped", n_episodes=1):
     release, model = make_release(config, n_episodes), make_model(config)
     boundary = BOUNDARIES[kind](release.task, release.traffic, model)
     release.traffic.load([0, 1])
-    boundary.load(np.array([0, 1]))
     return boundary, model
 
 

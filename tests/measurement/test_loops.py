@@ -39,7 +39,7 @@ def test_processes_that_share_loaded_traffic_read_the_same():
     given = {"traffic_seeds": [0], "horizon": 60, "loops": {"positions": [0.3], "interval": 20}}
     first = QueryProcess(resolve("short-highway", given))
     second = QueryProcess(first.config, traffic=first.traffic)
-    assert first.traffic.load([0]) == [0]
+    first.traffic.load([0])
     for process in (first, second):
         process.reset(np.arange(1), [np.random.default_rng(0)])
     passed = first.traffic.readings[0, :, 0, 0]

@@ -62,14 +62,14 @@ def test_an_empty_segment_has_its_own_limit_and_a_density_its_own_length():
 
 
 def test_missing_records_are_made_together_and_loaded_once(monkeypatch):
-    library, ensured = RecordLibrary(), []
+    library, ensured, read, record = RecordLibrary(), [], [], RecordLibrary().get(SHORT_HIGHWAY, 4)
     monkeypatch.setattr(library, "ensure", lambda corridor, seeds: ensured.append(list(seeds)))
+    monkeypatch.setattr(library, "get", lambda corridor, seed: read.append(seed) or record)
     traffic = Traffic(SHORT_HIGHWAY, (4, 7, 9), library)
-    assert traffic.load(0) == [0]
-    monkeypatch.setattr(library, "get", lambda corridor, seed: RecordLibrary().get(corridor, 4))
-    assert traffic.load(np.array([2, 0, 1, 2])) == [1, 2]
-    assert traffic.load([0, 1, 2]) == []
+    for indices in (0, np.array([2, 0, 1, 2]), [0, 1, 2]):
+        traffic.load(indices)
     assert ensured == [[7, 9]]
+    assert read == [4, 7, 9]
 
 
 # --- ledgers ----------------------------------------------------------------------------------
