@@ -52,18 +52,20 @@ _NO_QUERIES = {
 """Keywords that a road file may have for queries, which nobody asks here."""
 
 
-class Entries(NamedTuple):
-    """Additions of the sources of one interval to K cells of the stream."""
+class Additions(NamedTuple):
+    """Additions of sources to K places of the stream."""
 
-    seconds: IntArray  # in which they count, and which can still change
+    seconds: IntArray  # (K,)
     # (K,) segments, and boundary segments beside them where a source knows both quantities
     cells: IntArray
     added: FloatArray  # (K, 2, 2) weights 1 / std^2 and weighted values of both quantities
 
+    def unchanged(self, second: int) -> int:
+        """Return the last second up to one that they leave as it was."""
+        return min(second, int(self.seconds.min(initial=second + 1)) - 1)
 
-def told_in(seconds: int, by_flow: bool) -> IntArray:
-    """Return the seconds of an interval, from 0 on, in which what a source says of it counts."""
-    return seconds_told(seconds) if by_flow else np.arange(seconds)
+
+_NOTHING = Additions(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2, 2)))
 
 
 class RoadEstimator:
@@ -117,16 +119,15 @@ class RoadEstimator:
         self._borders: dict[int | None, tuple[int, FloatArray]] = {None: (0, borders_of(geometry))}
         for face, _, segments in geometry.ramps():
             self._borders[face] = segments[0], borders_of(geometry, segments)
-        settings = config.settings()
-        if stations is None:
-            stations = () if self.corridor.loops is None else self.corridor.loops.positions
-        distance = self._distance(stations)
+        settings, distance = config.settings(), self._distance(stations)
         if distance > 0.0 and config.estimator_settings is None and hasattr(settings, "asm"):
             own = dataclasses.replace(settings.asm, length=min(max(0.5 * distance, 0.1), 1.0))
             settings = dataclasses.replace(settings, asm=own)
         self._estimator = make_estimator(estimator, "compiled", self.model, 1, settings)
         self.time = self._start = integer("start", start, -LATEST, LATEST)
         self._made_of = {
+            "format": FORMAT,
+            "version": numbers_of(code_version()),
             "road": json_digest([repr(self.corridor.geometry), self.corridor.digest]),
             "estimator": name_of_class(type(self._estimator)),
             "settings": json_digest([repr(settings), repr(config.parameters)]),
@@ -138,7 +139,7 @@ class RoadEstimator:
         self._stream = np.zeros((N_ROWS, self.corridor.geometry.n_cells, 2, 2))
         prior = nominal_state(self.corridor, self.model, np.array([0]))
         self._estimator.reset(_ONE, prior, [np.random.default_rng(0)])
-        self._kept = {self.time: self._copies()}
+        self._kept = {self.time: self._packed()}
         self._estimates = {self.time: self._estimator.estimate()}
 
     def step(self, seen: Iterable[Seen] = (), seconds: int = 1) -> None:
@@ -157,15 +158,15 @@ class RoadEstimator:
             UserWarning: A point lies within a segment and counts at its border.
         """
         now = self.time + integer("seconds", seconds, 1, 10**7)
-        integer("time", now, -LATEST, LATEST)
-        is_sequence = isinstance(seen, Iterable) and not isinstance(seen, str | bytes)
-        require(is_sequence, "seen", "a sequence of what station() and others return", seen)
-        entries = self._entries(list(seen), now)
-        changed = min([self.time, *(int(each.seconds[0]) - 1 for each in entries)])
-        with self._whole(range(max(changed, now - N_ROWS) + 1, now + 1)):
+        allowed = "a sequence of what station() and others return"
+        require(isinstance(seen, Iterable), "seen", allowed, seen)
+        seen = list(seen)
+        additions = self._additions(seen, now) if seen else _NOTHING
+        unchanged = max(additions.unchanged(self.time), now - N_ROWS)
+        with self._whole(range(unchanged + 1, now + 1)):
             while now - self.time > LONGEST:
-                self._go_on(self.time + LONGEST, [])
-            self._go_on(now, entries)
+                self._go_on(self.time + LONGEST)
+            self._go_on(now, additions)
 
     def estimate(self, delay: int = 0) -> Estimate:
         """Return density [veh/km] and speed [km/h] of every segment, and deviations, (S,) each.
@@ -184,9 +185,10 @@ class RoadEstimator:
         """Return the oldest state that is kept, and the stream since, for `load`."""
         first = min(self._kept)
         since = np.arange(first + 1, self.time + 1) % N_ROWS
-        arrays = {**_as_bytes(self._kept[first]), "stream": self._stream[since]}
+        # As bytes, so that NaN and flags can be stored, too.
+        arrays = {"memory": self._kept[first], "stream": self._stream[since].view(np.uint8)}
         times = {"start": self._start, "first": first, "time": self.time}
-        return dump_tensors(arrays, {**self._about(), **times}, "state", LARGEST_STATE)
+        return dump_tensors(arrays, {**self._made_of, **times}, "state", LARGEST_STATE)
 
     def load(self, state: bytes) -> None:
         """Go on where another one, made alike, was saved, with the same bits.
@@ -200,7 +202,7 @@ class RoadEstimator:
         """
         require(isinstance(state, bytes), "state", "the bytes that save() returned", state)
         card, arrays = parse_tensors(state, "state")
-        for name, value in self._about().items():
+        for name, value in self._made_of.items():
             require(card.get(name) == value, f"state.{name}", repr(value), card.get(name))
         start, first, now = (
             integer(f"state.{name}", card.get(name), -LATEST, LATEST)
@@ -208,27 +210,21 @@ class RoadEstimator:
         )
         is_stream = start <= first <= now < first + N_ROWS
         require(is_stream, "state.time", "one of a stream", now)
-        memory = self._copies()
-        shapes = {name: array.shape for name, array in _as_bytes(memory).items()}
-        stream = {"stream": (now - first, *self._stream.shape[1:])}
-        with within("state: "):
-            require_arrays({k: v for k, v in arrays.items() if k in shapes}, shapes, np.uint8)
-            require_arrays({k: v for k, v in arrays.items() if k not in shapes}, stream, float)
-            for i, array in enumerate(memory):
-                array[...] = arrays[f"memory_{i}"].view(array.dtype).reshape(array.shape)
-            *of_estimator, ends = memory
-            self._estimator.check_memory(of_estimator)
-            for name, array in (("ends", ends), ("stream", arrays["stream"])):
+        n_rows, row = now - first, self._stream[0].view(np.uint8).shape
+        shapes = {"memory": self._packed().shape, "stream": (n_rows, *row)}
+        with within("state: "), self._whole(range(N_ROWS)):
+            require_arrays(arrays, shapes, np.uint8)
+            self._start, self.time = start, first
+            self._kept = {first: arrays["memory"]}
+            self._stream[np.arange(first + 1, now + 1) % N_ROWS] = arrays["stream"].view(np.float64)
+            self._restore(first)
+            self._estimator.check_memory()
+            for name, array in (("ends", self._ends), ("stream", self._stream)):
                 wrong = array[~np.isfinite(array)].tolist()
                 require(not wrong, name, "finite", wrong[:1])
-            with self._whole(range(N_ROWS)):
-                self._start, self.time = start, first
-                self._kept = {first: memory}
-                self._stream[np.arange(first + 1, now + 1) % N_ROWS] = arrays["stream"]
-                self._restore(first)
-                self._estimates = {first: self._estimator.estimate()}
-                self._run(first, now)
-                self._estimator.check_estimate(self._estimates[now])
+            self._estimates = {first: self._estimator.estimate()}
+            self._run(first, now)
+            self._estimator.check_estimate(self._estimates[now])
 
     @contextmanager
     def _whole(self, seconds: range) -> Iterator[None]:
@@ -246,66 +242,53 @@ class RoadEstimator:
             self._restore(self.time)
             raise
 
-    def _about(self) -> dict[str, str]:
-        """Return what must be alike where a state is loaded."""
-        return {"format": FORMAT, "version": numbers_of(code_version()), **self._made_of}
-
-    def _entries(self, seen: Sequence[Any], now: int) -> list[Entries]:
+    def _additions(self, seen: Sequence[Any], now: int) -> Additions:
         """Return what sources add to the stream at second `now`, or refuse them."""
-        spans: dict[tuple[int, int, bool], list[tuple[Seen, IntArray]]] = {}
+        oldest = max(now - LONGEST, self._start) + 1
+        seconds, segments, told = [], [], []
         for i, each in enumerate(seen):
             path, allowed = f"seen[{i}]", "what station(), probes() or Seen() returns"
             require(isinstance(each, Seen), path, allowed, each)
-            until, oldest = each.until, max(now - LONGEST, self._start)
-            until = now if until is None else until
-            allowed = f"in {oldest + 1}..{now}, which can still change"
-            require(oldest < until <= now, f"{path}.until", allowed, until)
-            span = until, each.seconds, each.flow is not None
-            spans.setdefault(span, []).append((each, self._segments(path, each)))
-        found = []
-        for (until, seconds, by_flow), own in spans.items():
-            told = until - seconds + 1 + told_in(seconds, by_flow)
-            told = told[told > max(now - LONGEST, self._start)]
-            if told.size:  # the middle of an interval may be before the beginning
-                found.append(Entries(told, *self._added(*zip(*own, strict=True))))
-        return found
-
-    def _added(
-        self, seen: Sequence[Seen], places: Sequence[IntArray]
-    ) -> tuple[IntArray, FloatArray]:
-        """Return what sources add to cells, given the segments of each of them."""
-        fields = ((x.density, x.speed, x.density_std, x.speed_std, x.flow, x.seconds) for x in seen)
-        told = np.array([*fields], dtype=np.float64)  # NaN for None
-        segments = np.concatenate(places)
-        added = self._weighted(told.repeat([*map(len, places)], axis=0), segments)
-        own, end = np.nonzero(segments[:, None] == self.corridor.road.beside)
+            until, allowed = now if each.until is None else each.until, f"in {oldest}..{now}"
+            in_time = oldest <= until <= now
+            require(in_time, f"{path}.until", f"{allowed}, which can still change", until)
+            segments.append(self._segments(path, each))
+            n = each.seconds
+            counts = until - n + 1 + (np.arange(n) if each.flow is None else seconds_told(n))
+            seconds.append(counts[counts >= oldest])
+            fields = each.density, each.speed, each.density_std, each.speed_std, each.flow
+            told.append((*fields, n, counts.size))
+        place, n_segments = np.concatenate(segments), [*map(len, segments)]
+        source = np.arange(len(seen)).repeat(n_segments)
+        added = self._weighted(np.array(told, np.float64)[source], place)
+        # Cells: the segments, and boundary segments where both quantities are known beside them.
+        own, end = np.nonzero(place[:, None] == self.corridor.road.beside)
         knows_both = added[own, :, 0].all(axis=1)
-        cells = np.concatenate([segments, self.model.n_segments + end[knows_both]])
-        return cells, np.concatenate([added, added[own[knows_both]]])
+        cell = np.concatenate([place, self.model.n_segments + end[knows_both]])
+        index = np.concatenate([np.arange(place.size), own[knows_both]])
+        own_seconds = [seconds[i] for i in source[index].tolist()]
+        times = [*map(len, own_seconds)]
+        return Additions(
+            np.concatenate(own_seconds), cell.repeat(times), added[index.repeat(times)]
+        )
 
     def _weighted(self, told: FloatArray, segments: IntArray) -> FloatArray:
         """Return weights and weighted values of what K segments are told, (K, 2, 2).
 
         Args:
-            told: Density, speed, their deviations, flow and seconds, (K, 6), NaN for none.
+            told: Density, speed, their deviations, flow, seconds, and in how many of these it
+                counts, (K, 7), NaN for none.
             segments: Shape (K,).
         """
-        road, seconds = self.corridor.road, told[:, 5]
-        values, stds, flow = told[:, :2].T, told[:, 2:4].T, told[:, 4]
-        by_flow = ~np.isnan(flow)
-        if by_flow.any():
-            said = interpreted(
-                flow, values[1], seconds.astype(np.int64), road.lanes[segments],
-                road.lengths[segments], road.limits[segments], segments >= road.n_mainline,
-            )  # fmt: skip
-            values = np.where(by_flow, np.stack(said[:2]), values)
-            stds = np.where(by_flow, np.stack(said[2:4]), stds)
+        road, (*values, flow, seconds, times) = self.corridor.road, told.T
+        said = interpreted(
+            flow, values[1], seconds, road.lanes[segments], road.lengths[segments],
+            road.limits[segments], segments >= road.n_mainline,
+        )  # fmt: skip
+        found = np.where(np.isnan(flow), values, said)
         # An interval counts once, since its errors are alike.
-        times = [
-            len(told_in(n, flows)) for n, flows in zip(seconds.astype(int), by_flow, strict=True)
-        ]
-        weights = np.nan_to_num(1.0 / (np.array(times) * stds**2))
-        return np.stack([weights, weights * np.nan_to_num(values)], axis=-1).swapaxes(0, 1)
+        weights = np.nan_to_num(1.0 / (times * found[2:] ** 2))
+        return np.stack([weights, weights * np.nan_to_num(found[:2])], axis=-1).swapaxes(0, 1)
 
     def _segments(self, path: str, each: Seen) -> IntArray:
         """Return the segments that a source says something of."""
@@ -313,9 +296,8 @@ class RoadEstimator:
         allowed = f"None or the face of a ramp, {faces}"
         require(each.ramp in self._borders, f"{path}.ramp", allowed, each.ramp)
         first, borders = self._borders[each.ramp]
-        for name in ("start", "end"):
-            place, allowed = getattr(each, name), f"in 0..{borders[-1]:g} km"
-            require(place <= borders[-1] + TOLERANCE, f"{path}.{name}", allowed, place)
+        is_there, allowed = each.end <= borders[-1] + TOLERANCE, f"in 0..{borders[-1]:g} km"
+        require(is_there, f"{path}.end", allowed, each.end)
         n, middle = len(borders) - 1, 0.5 * (each.start + each.end) + TOLERANCE
         there = min(int(np.searchsorted(borders, middle, "right")) - 1, n - 1)
         if each.start < each.end:
@@ -331,16 +313,13 @@ class RoadEstimator:
         low, high = max(face - 1, 0), min(face + 1, n)
         return np.arange(first + low, first + high)
 
-    def _go_on(self, now: int, entries: Sequence[Entries]) -> None:
+    def _go_on(self, now: int, additions: Additions = _NOTHING) -> None:
         """Go on to second `now`, from before what has changed."""
         self._stream[np.arange(self.time + 1, now + 1) % N_ROWS] = 0.0
-        changed = self.time
-        for seconds, cells, added in entries:
-            total = np.zeros(self._stream.shape[1:])
-            np.add.at(total, cells, added)  # a cell may be there several times
-            self._stream[seconds % N_ROWS] += total
-            changed = min(changed, int(seconds[0]) - 1)
-        back = max(second for second in self._kept if second <= changed)
+        seconds, cells, added = additions
+        np.add.at(self._stream, (seconds % N_ROWS, cells), added)  # a cell may be there twice
+        unchanged = additions.unchanged(self.time)
+        back = max(second for second in self._kept if second <= unchanged)
         if back < self.time:
             self._restore(back)
         self._run(back, now)
@@ -350,7 +329,7 @@ class RoadEstimator:
         for second in range(back + 1, now + 1):
             self._advance(second)
             if now - second <= SPACING * (second & -second):
-                self._kept[second] = self._copies()
+                self._kept[second] = self._packed()
         self.time = now
         gone = [second for second in self._kept if second <= now - LONGEST]
         first = max(gone, default=min(self._kept))
@@ -391,28 +370,27 @@ class RoadEstimator:
             inputs[0, column] = self._demand[elapsed, column]
         return inputs
 
-    def _copies(self) -> list[AnyArray]:
-        return [array.copy() for array in (*self._estimator.memory, self._ends)]
+    def _packed(self) -> AnyArray:
+        """Return the bytes of the present state."""
+        arrays = *self._estimator.memory, self._ends
+        return np.concatenate([array.ravel().view(np.uint8) for array in arrays])
 
     def _restore(self, second: int) -> None:
         """Go back to the state of a second, and forget later ones."""
         self._kept = {t: state for t, state in self._kept.items() if t <= second}
-        for array, kept in zip(
-            (*self._estimator.memory, self._ends), self._kept[second], strict=True
-        ):
-            array[...] = kept
+        begin, state = 0, self._kept[second]
+        for array in (*self._estimator.memory, self._ends):
+            own = state[begin : begin + array.nbytes]
+            array[...] = own.view(array.dtype).reshape(array.shape)
+            begin += array.nbytes
 
-    def _distance(self, stations: Sequence[float]) -> float:
+    def _distance(self, stations: Sequence[float] | None) -> float:
         """Return the mean distance of stations [km], 0 where there are no two of them."""
+        loops, length = self.corridor.loops, self._borders[None][1][-1]
+        if stations is None:
+            stations = () if loops is None else loops.positions
         places = convert(tuple[float, ...], stations, "stations")
-        length = self._borders[None][1][-1]
         allowed = f"increasing places in 0..{length:g} km"
         fits = list(places) == sorted(set(places)) and all(0.0 <= x <= length for x in places)
         require(fits, "stations", allowed, places)
         return (places[-1] - places[0]) / (len(places) - 1) if len(places) > 1 else 0.0
-
-
-def _as_bytes(arrays: Sequence[AnyArray]) -> dict[str, AnyArray]:
-    """Return arrays by name as bytes, so that NaN and flags can be stored, too."""
-    named = enumerate(arrays)
-    return {f"memory_{i}": np.frombuffer(each.tobytes(), np.uint8) for i, each in named}

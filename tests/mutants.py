@@ -758,9 +758,9 @@ MUTANTS = (
     ),
     Mutant(
         "a reading holds true densities", 25, "measurement/loops.py",
-        "self._traffic.readings[traffic, interval]",
-        "self._traffic.readings[traffic, interval] "
-        "+ self._traffic.aggregates(traffic, interval)[:, :1]",
+        "self._traffic.readings[traffic[some], interval[some]]",
+        "self._traffic.readings[traffic[some], interval[some]] "
+        "+ self._traffic.aggregates(traffic[some], interval[some])[:, :1]",
         "test_non_interference.py",
     ),
     Mutant(

@@ -355,7 +355,7 @@ def test_a_state_of_another_version_is_refused(monkeypatch):
         make().load(state)
 
 
-@pytest.mark.parametrize("name", ["memory_0", "stream"])
+@pytest.mark.parametrize("name", ["memory", "stream"])
 def test_a_state_with_other_arrays_is_refused(name):
     road = played(make(), 70)
     card, arrays = files.parse_tensors(road.save(), "state")
@@ -393,14 +393,10 @@ def test_a_forged_state_is_refused_and_nothing_is_lost(estimator, byte):
 def test_an_index_out_of_range_is_no_memory(field):
     estimator = make("mhe")._estimator
     place = [*estimator._windows._fields].index(field) + 3
-    for value, allowed in ((estimator.memory[place].flat[0], True), (-9, False)):
-        memory = [array.copy() for array in estimator.memory]
-        memory[place][...] = value
-        if allowed:
-            estimator.check_memory(memory)
-        else:
-            with pytest.raises(ValueError, match=rf"^memory\[{place}\] must be in .*, got -9"):
-                estimator.check_memory(memory)
+    estimator.check_memory()
+    estimator.memory[place][...] = -9
+    with pytest.raises(ValueError, match=rf"^memory\[{place}\] must be in .*, got -9"):
+        estimator.check_memory()
 
 
 def test_a_mixture_knows_the_ranges_of_its_experts():
@@ -446,7 +442,7 @@ def test_a_step_or_a_restart_that_ends_early_changes_nothing(monkeypatch, proble
 REFUSED = [
     (
         [Seen(0.7, 0.7, speed=90, speed_std=9)],
-        r"seen\[0\]\.start must be in 0\.\.0\.6 km, got 0\.7",
+        r"seen\[0\]\.end must be in 0\.\.0\.6 km, got 0\.7",
     ),
     ([Seen(0.1, 0.9, speed=90, speed_std=9)], r"seen\[0\]\.end must be in 0\.\.0\.6 km, got 0\.9"),
     (
@@ -458,7 +454,7 @@ REFUSED = [
     (loops(0, until=10**400), r"seen\[0\]\.until must be in .*, got an integer of 400 digits"),
     ([*loops(0), (0.1, 0.2)], r"seen\[3\] must be what station\(\), .*, got \(0\.1, 0\.2\)"),
     (Seen(0.1, 0.1, speed=90, speed_std=9), "seen must be a sequence"),
-    ("abc", "seen must be a sequence"),
+    ("abc", r"seen\[0\] must be what station\(\), .*, got 'a'"),
     (None, "seen must be a sequence"),
 ]
 

@@ -288,25 +288,23 @@ class Estimator(ABC):
         """Arrays of `_memory` that index others, or may be NaN, with their least and largest."""
         return ()
 
-    def check_memory(self, memory: Sequence[AnyArray]) -> None:
-        """Refuse numbers that no past leaves; kernels index by some of them, unchecked.
-
-        Args:
-            memory: Arrays of the types and shapes of `memory`.
+    def check_memory(self) -> None:
+        """Refuse numbers in `memory` that no past leaves; kernels index by some, unchecked.
 
         Raises:
             ValueError: A number is not finite, an index is out of range, or a flag is neither 0
                 nor 1.
         """
         limits = {id(array): (low, high) for array, low, high in self._limits}
-        for i, (own, given) in enumerate(zip(self.memory, memory, strict=True)):
-            numbers = given.view(np.uint8) if given.dtype == np.bool_ else given
-            allowed, wrong = "finite", ~np.isfinite(numbers)
-            if given.dtype == np.bool_:
+        for i, array in enumerate(self.memory):
+            numbers = array.view(np.uint8) if array.dtype == np.bool_ else array
+            if array.dtype == np.bool_:
                 allowed, wrong = "0 or 1", numbers > 1
-            elif id(own) in limits:
-                low, high = limits[id(own)]
+            elif id(array) in limits:
+                low, high = limits[id(array)]
                 allowed, wrong = f"in {low:g}..{high:g}", (numbers < low) | (numbers > high)
+            else:
+                allowed, wrong = "finite", ~np.isfinite(numbers)
             first = next(iter(numbers[wrong].tolist()), None)
             require(first is None, f"memory[{i}]", allowed, first)
 

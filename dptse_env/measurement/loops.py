@@ -165,17 +165,12 @@ class LoopReadings:
         shape = traffic.readings.shape[1], segments.size, 4
         self._said = traffic.derived(shape, self._said_of)
 
-    def read(self, traffic: IntArray, interval: IntArray) -> FloatArray:
-        """Return readings (k, F, 2) of intervals, from 0 on, of traffic seeds by index, (k,)."""
-        found: FloatArray = self._traffic.readings[traffic, interval]
-        return found
-
     def last(self, traffic: IntArray, times: IntArray) -> FloatArray:
         """Return last readings (k, F, 2) at seconds of the record (k,), NaN before the first."""
         interval = times // self.interval - 1
         n_stations, some = self._traffic.readings.shape[2], interval >= 0
         found = np.full((len(times), n_stations, 2), np.nan)
-        found[some] = self.read(traffic[some], interval[some])
+        found[some] = self._traffic.readings[traffic[some], interval[some]]
         return found
 
     def said(self, read: FloatArray) -> Said:

@@ -16,7 +16,6 @@ from dptse_env.utils.validation import (
     inside,
     integer,
     non_negative,
-    number,
     require,
 )
 
@@ -62,22 +61,19 @@ class Seen:
         """Check values."""
         checked_fields(self, "seen")
         require(self.start <= self.end, "seen.end", f">= start, {self.start:g} km", self.end)
-        if self.flow is not None:
-            self._check_flow(self.flow)
+        if self.flow is None:
+            for name in ("density", "speed"):
+                value, std = getattr(self, name), getattr(self, f"{name}_std")
+                allowed = f"a number where {name} is one, and None elsewhere"
+                require((value is None) == (std is None), f"seen.{name}_std", allowed, std)
+            known = self.density is not None or self.speed is not None
+            require(known, "seen.speed", "a number where there is no density", None)
             return
-        for name in ("density", "speed"):
-            value, std = getattr(self, name), getattr(self, f"{name}_std")
-            allowed = f"a number where {name} is one, and None elsewhere"
-            require((value is None) == (std is None), f"seen.{name}_std", allowed, std)
-        known = self.density is not None or self.speed is not None
-        require(known, "seen.speed", "a number where there is no density", None)
-
-    def _check_flow(self, flow: float) -> None:
+        others = self.density, self.density_std, self.speed_std
+        alone, allowed = others == (None,) * 3, "None where there are densities or deviations"
+        require(alone, "seen.flow", allowed, self.flow)
         require(self.start == self.end, "seen.end", f"start, {self.start:g} km", self.end)
-        for name in ("density", "density_std", "speed_std"):
-            value = getattr(self, name)
-            require(value is None, f"seen.{name}", "None where there is a flow", value)
-        known = flow == 0.0 or self.speed is not None
+        known = self.flow == 0.0 or self.speed is not None
         require(known, "seen.speed", "a number where vehicles passed", self.speed)
         allowed = f">= {SHORTEST} where there is a flow"
         require(self.seconds >= SHORTEST, "seen.seconds", allowed, self.seconds)
@@ -108,7 +104,6 @@ def station(
         ValueError: A value is out of range, both or none of `count` and `flow` are given, or there
             is a count without a speed.
     """
-    km = number(float, km, "station.km", Interval(0, 1e4))
     seconds = integer("station.seconds", seconds, SHORTEST, LONGEST)
     allowed = "given where flow is not, and only there"
     require((count is None) != (flow is None), "station.count", allowed, count)
