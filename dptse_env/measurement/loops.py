@@ -152,16 +152,14 @@ class LoopReadings:
         least_density = 1.0 / road.lengths[segments]
         self._places = Bundle(Places(channels, segments, least_density, task.releases_flow))
         self._limit = road.limits[segments]
-        told = seconds_told(self.interval)
-        self._tells = np.isin(np.arange(self.interval), told)
-        self._n_told = len(told)
+        self._tells = np.isin(np.arange(self.interval), seconds_told(self.interval))
         # Pairs of a station and a segment beside it.
         pairs = np.arange(len(beside)).repeat(2), place.reshape(-1)
-        self._station, self._place = np.unique(np.array(pairs), axis=1)
-        beside = segments[self._place]
+        self._station, place = np.unique(np.array(pairs), axis=1)
+        beside = segments[place]
         on_ramp = beside >= road.n_mainline
         self._pairs = road.lanes[beside], road.lengths[beside], road.limits[beside], on_ramp
-        self._mean = np.eye(segments.size)[self._place]  # (pairs, L)
+        self._mean = np.eye(segments.size)[place]  # (pairs, L)
         shape = traffic.readings.shape[1], segments.size, 4
         self._said = traffic.derived(shape, self._said_of)
 
@@ -179,31 +177,26 @@ class LoopReadings:
         A segment between two stations has the mean of both, and of their deviations.
         """
         flow, speed = read[:, self._station, 0] * (HOUR / self.interval), read[:, self._station, 1]
-        found = interpreted(flow, speed, self.interval, *self._pairs)
-        known, passed = np.isfinite(found.density), np.isfinite(found.speed)
-        by_name = zip(Said._fields, found, strict=True)
-        means = {
-            name: self._averaged(values, passed if name.startswith("speed") else known)
-            for name, values in by_name
-        }
-        untold = np.isnan(means["speed"])
-        means["speed"] = np.where(untold, self._limit, means["speed"])
-        means["speed_std"] = np.where(untold, UNKNOWN, means["speed_std"])
-        return Said(**means)
+        told = interpreted(flow, speed, self.interval, *self._pairs)
+        means = Said(*map(self._averaged, told))
+        untold = np.isnan(means.speed)
+        return means._replace(
+            speed=np.where(untold, self._limit, means.speed),
+            speed_std=np.where(untold, UNKNOWN, means.speed_std),
+        )
 
-    def _averaged(self, values: FloatArray, known: BoolArray) -> FloatArray:
+    def _averaged(self, values: FloatArray) -> FloatArray:
         """Return means (k, L) of what is known at the stations beside a segment; NaN for none."""
+        known = np.isfinite(values)
         total, n = np.where(known, values, 0.0) @ self._mean, known @ self._mean
         means: FloatArray = np.where(n > 0.0, total, np.nan) / np.maximum(n, 1.0)
         return means
 
     def _said_of(self, index: int) -> FloatArray:
         """Return what is said in all intervals of a record, (K, L, 4)."""
-        said = self.said(self._traffic.readings[index])
-        more = self._n_told**0.5  # the errors of an interval are alike
-        return np.stack(
-            [said.density, said.speed, more * said.density_std, more * said.speed_std], -1
-        )
+        said: FloatArray = np.stack(self.said(self._traffic.readings[index]), axis=-1)
+        said[..., 2:] *= np.count_nonzero(self._tells) ** 0.5  # errors of an interval are alike
+        return said
 
     def said_until(self, traffic: IntArray, times: IntArray) -> FloatArray:
         """Return what is said of the intervals that end at seconds (k,), each time it is told.
