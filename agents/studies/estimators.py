@@ -3,8 +3,8 @@
 In the part ``estimators`` every vehicle answers queries: errors of every estimator under every
 release model, how honest its deviations are, and how the recurrent network does away from what it
 was trained on. In the part ``penetration`` a share p of the vehicles is connected and answers
-queries, beside three detectors on the mainline that count every vehicle. In the part ``loops``
-stations of loop detectors stand in place of these.
+queries, beside three fixed sensors on the mainline that count every vehicle. In the part ``loops``
+stations of loops stand in place of these.
 """
 
 from __future__ import annotations
@@ -112,18 +112,18 @@ WORLD_CELLS = [
     world_cell(*each) for each in (*product(WORLDS, EVERYONE), *product(ELSEWHERE, MOVED))
 ]
 
-# ---- The second part: a share of the vehicles answers, beside detectors. ----
+# ---- The second part: a share of the vehicles answers, beside fixed sensors. ----
 
 RELEASES = ("printed", "corrected", "capped", "paced")
 GUARANTEED = ("capped", "paced")
-"""Release models in which queries and detectors share a budget."""
+"""Release models in which queries and fixed sensors share a budget."""
 ESTIMATORS = (EKF, "ukf", "enkf", "mhe", LEARNED, SMOOTHING, WALK)
 SHARES = {f"{percent} %": percent / 100 for percent in (1, 3, 10, 30, 100)}
 BASE_SHARE = 0.1
-DETECTORS = (3, 7, 11)
+FIXED_SENSORS = (3, 7, 11)
 BOTH, QUERIES, PART, WHOLE = ("both", "queries", "detectors", "detectors, whole budget")
 EPSILON, WHOLE_EPSILON = 5.0, 8.449590646976443
-"""Epsilon of both mechanisms; the second one makes the detectors' part worth `EPSILON`."""
+"""Epsilon of both mechanisms; the second one makes the part of fixed sensors worth `EPSILON`."""
 SENSED_SEEDS = SEEDS[:20]
 
 
@@ -141,7 +141,7 @@ def sensed(
 
 
 def alone(release: str, estimator: str, sensors: str = WHOLE) -> Labels:
-    """Return the labels of detectors alone, which no share changes.
+    """Return the labels of fixed sensors alone, which no share changes.
 
     Without a guarantee there is no budget, and a part of it is all of it.
     """
@@ -158,7 +158,7 @@ def sensed_cell(labels: Labels) -> Cell:
         "estimator": labels["estimator"],
         "bandwidth": 5,
         "penetration": {"share": labels["share"]},
-        "corridor": {"fixed_sensors": [] if sensors == QUERIES else list(DETECTORS)},
+        "corridor": {"fixed_sensors": [] if sensors == QUERIES else list(FIXED_SENSORS)},
     }
     if labels["estimator"] == LEARNED:  # its deviations are honest, filters do better without
         keywords["fusion"] = {"dwell_factor": 1.0}
@@ -174,7 +174,7 @@ SENSED_CELLS = [
     )
 ]
 
-# ---- The third part: loop detectors beside queries, and alone. ----
+# ---- The third part: loops beside queries, and alone. ----
 
 LOOPED = (LEARNED, "ukf", SMOOTHING)
 """The network, the best filter beside loops, and adaptive smoothing."""
@@ -272,11 +272,12 @@ def world_tables(rows: pl.DataFrame) -> list[str]:
     return [*parts, table("PrivateHighway-v1 but for", moved, columns)]
 
 
-SENSED_NOTES = f"""PrivateHighway-v1, detectors on segments {format_range(DETECTORS)}, round robin
-with 5 queries a second, traffic seeds {format_range(SENSED_SEEDS)}. Gains are in per cent of the
-error that they are compared with, paired, and bold where they are certain. Detectors alone have the
-part of the budget that they have beside queries, or all of it (ε = {WHOLE_EPSILON:.2f} for both, of
-which their part is worth ε = {EPSILON:g}); without a guarantee the two are one."""
+SENSED_NOTES = f"""PrivateHighway-v1, fixed sensors on segments {format_range(FIXED_SENSORS)},
+round robin with 5 queries a second, traffic seeds {format_range(SENSED_SEEDS)}. Gains are in per
+cent of the error that they are compared with, paired, and bold where they are certain. Fixed
+sensors alone have the part of the budget that they have beside queries, or all of it
+(ε = {WHOLE_EPSILON:.2f} for both, of which their part is worth ε = {EPSILON:g}); without a
+guarantee the two are one."""
 Pair = tuple[str, str]
 """A release model and an estimator."""
 
@@ -298,13 +299,13 @@ def sensed_tables(rows: pl.DataFrame) -> list[str]:
     columns: dict[str, Callable[[Pair], str]] = {
         "both, error x 1000": lambda c: error(sensed(*c)),
         "below queries alone": lambda c: gain(sensed(*c), sensed(*c, sensors=QUERIES)),
-        "below detectors alone": lambda c: gain(sensed(*c), alone(*c, PART)),
-        "below detectors with the whole budget": lambda c: gain(sensed(*c), alone(*c)),
+        "below fixed sensors alone": lambda c: gain(sensed(*c), alone(*c, PART)),
+        "below fixed sensors with the whole budget": lambda c: gain(sensed(*c), alone(*c)),
     }
     parts = ["# A share of the vehicles answers", SENSED_NOTES, "![Errors](fig_arms.png)"]
     parts += [f"## Both or either alone, p = {BASE_SHARE:g}", table("", everyone, columns)]
     columns = {name: partial(of_share, share) for name, share in SHARES.items()}
-    title = "## Both below detectors with the whole budget"
+    title = "## Both below fixed sensors with the whole budget"
     return [*parts, title, table("", everyone, columns)]
 
 
@@ -338,7 +339,7 @@ def loop_table(rows: pl.DataFrame) -> list[str]:
         for interval in (0, *LOOP_INTERVALS)
     }
     columns["χ², every 60 s"] = lambda c: chi2_text(rows, {**c, "interval": 60})
-    return ["# Loop detectors", LOOP_NOTES, table("", lines, columns)]
+    return ["# Loops", LOOP_NOTES, table("", lines, columns)]
 
 
 # ---- Figures. ----
@@ -366,13 +367,13 @@ def draw_arms(rows: pl.DataFrame) -> Figure:
     axes = figure.subplots(2, len(RELEASES), sharex=True, sharey="row")
     percent = [100.0 * share for share in SHARES.values()]
     arms = {
-        "queries and detectors": (BOTH, Look("#d55e00", "s")),
+        "queries and fixed sensors": (BOTH, Look("#d55e00", "s")),
         "queries alone": (QUERIES, Look("#0072b2", "o", "--")),
     }
     for axis, pair in zip(axes.flat, product((EKF, LEARNED), RELEASES), strict=True):
         estimator, release = pair
         level = mean(rows, alone(release, estimator), ERROR)
-        draw_level(axis, level, label="detectors alone, with the whole budget")
+        draw_level(axis, level, label="fixed sensors alone, with the whole budget")
         for name, (arm, look) in arms.items():
             cells = [sensed(release, estimator, share, arm) for share in SHARES.values()]
             draw_curve(axis, percent, [mean(rows, each, ERROR) for each in cells], look, name)
@@ -388,12 +389,12 @@ def draw_arms(rows: pl.DataFrame) -> Figure:
 FIGURES = {
     "fig_estimators.png": (draw_worlds, "Error x 1000 of the estimate under a round robin"),
     "fig_elsewhere.png": (draw_elsewhere, "The recurrent network away from PrivateHighway-v1"),
-    "fig_arms.png": (draw_arms, "Queries and detectors together, and either alone"),
+    "fig_arms.png": (draw_arms, "Queries and fixed sensors together, and either alone"),
 }
 
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
-    """Return the tables of both parts, and draw their figures."""
+    """Return the tables of all parts, and draw their figures."""
     for name, (draw, title) in FIGURES.items():
         save_measured(folder / name, f"{title}, 95 % intervals", draw, rows)
     return "\n\n".join([*world_tables(rows), *sensed_tables(rows), *loop_table(rows)])

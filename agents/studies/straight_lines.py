@@ -1,4 +1,4 @@
-"""Straight lines between stations of loop detectors, as an estimator: what others have to beat."""
+"""Straight lines between stations of loops, as an estimator: what others have to beat."""
 
 from __future__ import annotations
 
