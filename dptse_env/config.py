@@ -24,7 +24,7 @@ from dptse_env.estimators.tuned import (
     tuned_settings,
     tuned_with,
 )
-from dptse_env.measurement import Detectors, FusionSettings
+from dptse_env.measurement import FusionSettings, SensorSettings
 from dptse_env.model import ARZParameters, load_parameters
 from dptse_env.model.parameters import read_parameters
 from dptse_env.release import (
@@ -106,7 +106,7 @@ class EnvConfig:
             or objects; ``"default"`` stands for all default blocks.
         privacy: The release model with its epsilon, delta and unit of protection.
         penetration: The vehicles that are connected and answer queries; a number is their share.
-        detectors: Errors of the fixed sensors, and their part of the privacy budget.
+        sensor_settings: Errors of the fixed sensors, and their part of the privacy budget.
         fusion: Settings by which answers of connected vehicles and fixed sensors become
             measurements.
         reward: The reward: ``joint``, ``density``, ``speed``, a registered name,
@@ -133,7 +133,7 @@ class EnvConfig:
     observation: tuple[Any, ...] = (DEFAULT,)
     privacy: PrivacySettings = field(default=PrivacySettings())
     penetration: Penetration = field(default=Penetration())
-    detectors: Detectors = field(default=Detectors())
+    sensor_settings: SensorSettings = field(default=SensorSettings())
     fusion: FusionSettings = field(default=FusionSettings())
     reward: Any = "joint"
     horizon: Annotated[int, Interval(1, 100_000)] | None = None
@@ -182,7 +182,7 @@ class EnvConfig:
     @property
     def has_separate_sensors(self) -> bool:
         """True if fixed sensors measure other things than queries do."""
-        return not self.penetration.is_complete or self.detectors != Detectors()
+        return not self.penetration.is_complete or self.sensor_settings != SensorSettings()
 
     @cached_property
     def queries(self) -> Queries:
@@ -318,19 +318,19 @@ def _penetration(
     return found
 
 
-def _detectors(
-    path: str, value: Any, base: Detectors, corridor: Corridor, privacy: PrivacySettings
-) -> Detectors:
+def _sensor_settings(
+    path: str, value: Any, base: SensorSettings, corridor: Corridor, privacy: PrivacySettings
+) -> SensorSettings:
     """Return the errors of the fixed sensors, which there must be."""
-    found: Detectors = _typed(path, value, base)
+    found: SensorSettings = _typed(path, value, base)
     n, factor = len(corridor.fixed_sensors), found.factor
     each = f"one number, or one for each of the {n} fixed sensors"
     require(not isinstance(factor, tuple) or len(factor) == n, f"{path}.factor", each, factor)
     exact = "left out on a road without fixed sensors, and on one of measured fields"
     has_any = n > 0 and has_vehicles(corridor.recordings)
-    require(has_any or found == Detectors(), path, exact, found)
+    require(has_any or found == SensorSettings(), path, exact, found)
     alike = f"left out {_with_model(privacy)}, which knows of no groups of channels"
-    is_served = found == Detectors() or RELEASE_MODELS.find(privacy.preset).knows_groups
+    is_served = found == SensorSettings() or RELEASE_MODELS.find(privacy.preset).knows_groups
     require(is_served, path, alike, found)
     return found
 
@@ -515,7 +515,7 @@ KEYWORDS = {
     "corridor": Keyword(_corridor),
     "privacy": Keyword(_privacy, ("corridor",)),
     "penetration": Keyword(_penetration, ("corridor", "privacy")),
-    "detectors": Keyword(_detectors, ("corridor", "privacy")),
+    "sensor_settings": Keyword(_sensor_settings, ("corridor", "privacy")),
     "fusion": Keyword(),
     "estimator": Keyword(_estimator, ("corridor",)),
     "backend": Keyword(_backend, ("estimator", "corridor")),

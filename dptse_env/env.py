@@ -141,7 +141,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `observation`        | ("default",)    | blocks of the observation, see above                |
     | `privacy`            | "printed"       | or `corrected`, `capped`, `paced`, a mapping        |
     | `penetration`        | 1.0             | share of connected vehicles, or a mapping           |
-    | `detectors`          | {}              | errors of the fixed sensors, a mapping              |
+    | `sensor_settings`    | {}              | errors of the fixed sensors, a mapping              |
     | `fusion`             | {}              | how queries and sensors are put together            |
     | `reward`             | "joint"         | see above                                           |
     | `horizon`            | None            | length of an episode [s]; None for the record's     |
@@ -150,7 +150,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `truth_in_info`      | False           | whether `info` shows the true traffic               |
     | `epsilon`            | 1.0             | short for `privacy`'s                               |
     | `delta`              | 0.05            | short for `privacy`'s                               |
-    | `loops`              | None            | short for `corridor`'s: loop detectors, a mapping   |
+    | `loops`              | None            | short for `corridor`'s: loops, a mapping            |
     | `incident`           | "preset"        | short for `corridor`'s; `random`, `none`, a mapping |
     | `demand`             | "preset"        | short for `corridor`'s; `random`, a mapping         |
     | `render_mode`        | None            | or `rgb_array` (extra `plot`), `human` (`video`)    |

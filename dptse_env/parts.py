@@ -113,7 +113,7 @@ def make_task(config: EnvConfig, n_episodes: int = 1) -> Task:
         n_episodes=n_episodes,
         groups=make_groups(
             config.penetration,
-            config.detectors,
+            config.sensor_settings,
             config.corridor,
             private_boundary=privacy.boundary == "private",
         ),

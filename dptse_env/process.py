@@ -15,10 +15,10 @@ from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate, Estimator, Measurement, make_estimator
 from dptse_env.measurement import (
     BOUNDARIES,
-    DetectorErrors,
     Fusion,
     LoopReadings,
     Replay,
+    SensorErrors,
     nominal_state,
 )
 from dptse_env.model import ARZModel
@@ -75,9 +75,9 @@ class QueryProcess:
         boundary: The model's inputs at the road's ends and ramps.
         model: The traffic model.
         estimator: The estimator.
-        detectors: Errors of the fixed sensors; None where they have none.
+        sensor_errors: Errors of the fixed sensors; None where they have none.
         fusion: Turns releases into measurements of all vehicles; None where they are these.
-        loops: Readings of loop detectors; None where there are none.
+        loops: Readings of loops; None where there are none.
         replay: Takes the estimator back to where an interval began, with its readings; None where
             there are no loops.
         n_episodes: Size of the batch.
@@ -132,8 +132,8 @@ class QueryProcess:
         self.estimator: Estimator = make_estimator(
             config.estimator, config.backend, self.model, n, config.settings()
         )
-        exact, share = config.detectors.are_exact, config.penetration.published_share
-        self.detectors = None if exact else DetectorErrors(task, config.detectors)
+        exact, share = config.sensor_settings.are_exact, config.penetration.published_share
+        self.sensor_errors = None if exact else SensorErrors(task, config.sensor_settings)
         is_fused = config.has_separate_sensors
         self.fusion = Fusion(task, config.fusion, share) if is_fused else None
         self._threads = EpisodeThreads(threads if self.estimator.is_compiled else 1)
@@ -190,7 +190,7 @@ class QueryProcess:
         Args:
             episodes: Shape (k,).
             generators: One generator per episode; each gives 128 bits, of which the independent
-                streams of traffic, noise, estimator and detectors are spawned, whatever the
+                streams of traffic, noise, estimator and fixed sensors are spawned, whatever the
                 configuration.
             options: ``traffic_seed`` fixes the traffic (one of ``config.traffic_seeds``) and
                 ``start`` the first second of the record; each one value, or k of them.
@@ -204,14 +204,14 @@ class QueryProcess:
             raise RuntimeError("a fork cannot be reset: reset the process that it was made from")
         fixed = checked_options(options, self.config, len(episodes))
         streams = [list(map(np.random.default_rng, _seed_of(each).spawn(4))) for each in generators]
-        for_traffic, for_noise, for_estimator, for_detectors = zip(*streams, strict=True)
+        for_traffic, for_noise, for_estimator, for_sensors = zip(*streams, strict=True)
         traffic, starts = draw_traffic(fixed, self.config, for_traffic)
         self.traffic.load(traffic)
         self.traffic_index[episodes], self.time[episodes] = traffic, starts
         self.start[episodes] = starts
         self.pending.reset(episodes)
-        if self.detectors is not None:
-            self.detectors.reset(episodes, for_detectors)
+        if self.sensor_errors is not None:
+            self.sensor_errors.reset(episodes, for_sensors)
         self.release.reset(episodes, for_noise)
         self.boundary.reset(episodes)
         prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
@@ -296,13 +296,13 @@ class QueryProcess:
 
     def measure(self, request: Request) -> Measurement:
         """Release a second, which charges its vehicles; return what the estimator is given."""
-        if self.detectors is not None:
-            request = self.detectors.answering(request)
+        if self.sensor_errors is not None:
+            request = self.sensor_errors.answering(request)
         measured = self.release.release(request)
         if self._checks_releases:
             check_released(self.release, measured, request)
-        if self.detectors is not None:
-            measured = self.detectors.added(request.episodes, measured)
+        if self.sensor_errors is not None:
+            measured = self.sensor_errors.added(request.episodes, measured)
         if self.fusion is not None:
             measured = self.fusion.read(measured, request.prediction())
         return measured

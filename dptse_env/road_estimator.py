@@ -46,7 +46,7 @@ LATEST = 2**40
 
 _ONE = np.array([0])
 _NO_QUERIES = {
-    "privacy": "corrected", "penetration": 1.0, "detectors": {}, "query_spans": (1,),
+    "privacy": "corrected", "penetration": 1.0, "sensor_settings": {}, "query_spans": (1,),
     "bandwidth": 1,
 }  # fmt: skip
 """Keywords that a road file may have for queries, which nobody asks here."""

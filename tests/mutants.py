@@ -485,9 +485,9 @@ MUTANTS = (
         "test_streams.py",
     ),
     Mutant(
-        "errors of detectors are drawn from the stream of the noise", 17, "process.py",
-        "self.detectors.reset(episodes, for_detectors)",
-        "self.detectors.reset(episodes, for_noise)",
+        "errors of fixed sensors are drawn from the stream of the noise", 17, "process.py",
+        "self.sensor_errors.reset(episodes, for_sensors)",
+        "self.sensor_errors.reset(episodes, for_noise)",
         "measurement/test_sensors.py",
     ),
     Mutant(

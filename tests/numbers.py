@@ -73,7 +73,7 @@ RELEASES: dict[str, dict[str, Any]] = {
     "paced-spans": {"privacy": "paced", "query_spans": [1, 2]},
     "paced-connected": {"privacy": "paced", "penetration": 0.3},
     "capped-connected": {"privacy": "capped", "penetration": 0.3},
-    "paced-detectors": {"privacy": "paced", "detectors": {"absolute": 1.0}},
+    "paced-detectors": {"privacy": "paced", "sensor_settings": {"absolute": 1.0}},
 }
 SECONDS = 60
 SEEDS = range(8)

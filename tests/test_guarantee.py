@@ -12,7 +12,7 @@ import pytest
 
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import Estimate
-from dptse_env.measurement import Detectors
+from dptse_env.measurement import SensorSettings
 from dptse_env.parts import make_release
 from dptse_env.privacy import ROUNDING, mu_of
 from dptse_env.process import QueryProcess
@@ -254,7 +254,9 @@ def configuration(one_of):
         wrong = one_of({}, {"misreporting": 0.5, "misreport_factor": 0.6})
         options["penetration"] = Known(share=0.5, worlds=worlds, **wrong)
     if sensors and one_of(True, False):
-        options["detectors"] = one_of(Detectors(dropout=0.3), Detectors(budget_share=0.6))
+        options["sensor_settings"] = one_of(
+            SensorSettings(dropout=0.3), SensorSettings(budget_share=0.6)
+        )
     return EnvConfig(
         corridor=ROAD.replaced(fixed_sensors=sensors, speed_limit=limit),
         estimator=estimator,
@@ -479,7 +481,7 @@ class PacedAtOnce(Paced):
 
 
 EXIT, FAST_ONE, NOBODY = ROAD.geometry.n_segments + 1, (1, 150.0), (AWAY, 0.0)
-BOTH_SEE = {"penetration": Known(share=0.5), "detectors": Detectors(budget_share=0.6)}
+BOTH_SEE = {"penetration": Known(share=0.5), "sensor_settings": SensorSettings(budget_share=0.6)}
 OVERLAPPING = {"query_spans": (1, 2)}
 WORST = {
     "capped": (CappedSettings(cap=7, share=0.2), {}, (1, 0.0), FAST_ONE),

@@ -149,7 +149,7 @@ def test_traffic_does_not_show_through_a_schedule(preset, schedule):
     assert not unlike(blind(make_private(preset, privacy={"boundary_inputs": boundary})), schedule)
 
 
-PARTLY = {"penetration": [0.05, 0.4], "detectors": {"dropout": 0.2, "absolute": 0.5}}
+PARTLY = {"penetration": [0.05, 0.4], "sensor_settings": {"dropout": 0.2, "absolute": 0.5}}
 """A share of connected vehicles that is drawn for each seed, and sensors with errors."""
 
 

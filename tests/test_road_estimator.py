@@ -236,7 +236,7 @@ privacy = "paced"
 bandwidth = 2
 query_spans = [1, 2]
 penetration = 0.2
-detectors = { factor = 1.1 }
+sensor_settings = { factor = 1.1 }
 traffic_seeds = "0:3"
 """
 

@@ -74,7 +74,7 @@ def test_the_noise_depends_neither_on_the_estimator_nor_on_what_is_queried(estim
     np.testing.assert_array_equal(found, expected[:, :, [1, 4]])
 
 
-PARTLY = {"penetration": 0.3, "detectors": {"dropout": 0.2, "absolute": 0.5}}
+PARTLY = {"penetration": 0.3, "sensor_settings": {"dropout": 0.2, "absolute": 0.5}}
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_an_episode_is_scored_against_the_record_at_its_second(start):
         reward = process.step(TWO, np.ones((2, 6), dtype=np.int8)).reward
 
 
-def test_traffic_noise_estimator_and_detectors_have_streams_of_their_own(monkeypatch):
+def test_traffic_noise_estimator_and_sensors_have_streams_of_their_own(monkeypatch):
     """Four children of one seed of 128 bits, which no other episode shares."""
     given = []
 
@@ -121,14 +121,14 @@ def test_traffic_noise_estimator_and_detectors_have_streams_of_their_own(monkeyp
         return draw_traffic(fixed, config, generators)
 
     monkeypatch.setattr("dptse_env.process.draw_traffic", spied_draw)
-    process = begin((0, 0), EVERYWHERE, detectors={"dropout": 0.1}, estimator="enkf")
-    for part in (process.detectors, process.release, process.estimator):
+    process = begin((0, 0), EVERYWHERE, sensor_settings={"dropout": 0.1}, estimator="enkf")
+    for part in (process.sensor_errors, process.release, process.estimator):
         monkeypatch.setattr(part, "reset", spied(part.reset))
     given.clear()
     process.reset(TWO, [np.random.default_rng(seed) for seed in (1, 2)], EVERYWHERE)
-    traffic, detectors, noise, estimator = given
+    traffic, sensors, noise, estimator = given
     for episode in (0, 1):
-        streams = [each[episode] for each in (traffic, noise, estimator, detectors)]
+        streams = [each[episode] for each in (traffic, noise, estimator, sensors)]
         seeds = [stream.bit_generator.seed_seq for stream in streams]
         assert [seed.spawn_key for seed in seeds] == [(k,) for k in range(4)]
         assert len({tuple(seed.entropy) for seed in seeds}) == 1

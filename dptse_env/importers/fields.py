@@ -71,7 +71,7 @@ swapped: 0.75 to 0.9 and 0.0 to 0.55 were seen in measured and simulated traffic
 FEWEST_BLOCKS = 30
 """Blocks that this takes at least."""
 MOST_MISSED, MOST_UNSEEN, NEAR = 20.0, 8.0, 0.2
-"""Least number of vehicles that passed an empty cell if its detector was off, and least sum of
+"""Least number of vehicles that passed an empty cell if its sensor was off, and least sum of
 those that were in it in each interval, since a few may pass between two looks; and the length of
 road [km] on a side, of one cell at least, whose traffic shows that."""
 USUAL_SHARE = 0.5
@@ -88,7 +88,7 @@ class FieldSource:
 
     A missing value is ``nan``, or nothing between two delimiters. An empty cell needs no speed;
     zeros in both files are missing values where they are in all cells of an interval or in all
-    intervals of a cell, and so are densities of 0 where vehicles must have passed: detectors were
+    intervals of a cell, and so are densities of 0 where vehicles must have passed: sensors were
     off.
 
     Attributes:
@@ -170,7 +170,7 @@ class FieldSource:
             self._filled(*each, off) for each in (("density", density), (kind, other))
         )
         for columns, told in (
-            (off.any(axis=0), f"detectors were off: {off.sum()} zeros are gaps"),
+            (off.any(axis=0), f"sensors were off: {off.sum()} zeros are gaps"),
             (
                 stand.any(axis=0),
                 f"{path} is 0 where vehicles are and must have passed: is it right?",
@@ -274,7 +274,7 @@ class FieldSource:
                 )
 
     def _off(self, density: FloatArray, other: FloatArray, flow: FloatArray) -> BoolArray:
-        """Return where detectors were off, shape (cells, intervals): zeros that cannot be."""
+        """Return where sensors were off, shape (cells, intervals): zeros that cannot be."""
         zero = (density == 0.0) & (other == 0.0)
         off: BoolArray = zero & (zero.all(axis=0) | zero.all(axis=1, keepdims=True))
         return off | self._passed((density == 0.0) & ~np.isnan(other) & ~off, density, flow)
@@ -340,12 +340,12 @@ class FieldSource:
     def _gap(self, path: Path, cell: int, start: int, stop: int, off: BoolArray) -> str:
         """Return what is wrong with a gap, in rows and columns of the file."""
         line = self._line(cell, off)
-        told = " but zeros, as of detectors that are off (an empty cell has a speed or flow of nan)"
+        told = " but zeros, as of sensors that are off (an empty cell has a speed or flow of nan)"
         told = told if off[cell, start:stop].any() else ""
         if stop - start == off.shape[1]:
             return (
                 f"{path}: {line} must have values, got none{told}: leave out cells without a "
-                "detector, in all files, or fill them"
+                "sensor, in all files, or fill them"
             )
         return (
             f"{path}: {line} must have a value every {self.longest_gap:g} s, got none from "

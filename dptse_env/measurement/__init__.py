@@ -1,20 +1,20 @@
-"""Inputs of the estimator: boundary inputs, errors of detectors, loops, answers put together."""
+"""Inputs of the estimator: boundary inputs, errors of fixed sensors, loops, fusion of answers."""
 
 from dptse_env.measurement.boundary import BOUNDARIES, BoundaryModel, nominal_state
 from dptse_env.measurement.fusion import Fusion, FusionSettings
 from dptse_env.measurement.loops import LoopReadings
 from dptse_env.measurement.replay import Replay
-from dptse_env.measurement.sensors import DetectorErrors, Detectors, make_groups
+from dptse_env.measurement.sensors import SensorErrors, SensorSettings, make_groups
 
 __all__ = [
     "BOUNDARIES",
     "BoundaryModel",
-    "DetectorErrors",
-    "Detectors",
     "Fusion",
     "FusionSettings",
     "LoopReadings",
     "Replay",
+    "SensorErrors",
+    "SensorSettings",
     "make_groups",
     "nominal_state",
 ]

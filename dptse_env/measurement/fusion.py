@@ -1,4 +1,4 @@
-"""Fusion: what an estimator is told of answers of connected vehicles beside those of detectors.
+"""Fusion: what an estimator is told of answers of connected vehicles beside fixed sensors.
 
 It comes ahead of the estimator and is alike for every estimator. It reads public numbers alone, the
 releases and the estimator's prediction, so that no guarantee depends on it.

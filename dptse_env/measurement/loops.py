@@ -1,4 +1,4 @@
-"""Loop detectors: what their readings say of the segments beside them.
+"""Loops: what their readings say of the segments beside them.
 
 Readings are public before the releases and no part of any budget. A reading comes at the end of its
 interval and is told in the middle of it: `dptse_env.measurement.replay`. Were it told in every

@@ -1,4 +1,4 @@
-"""Connected vehicles and fixed sensors: their groups of channels, and the errors of detectors."""
+"""Connected vehicles and fixed sensors: their groups of channels, and errors of the latter."""
 
 import math
 from collections.abc import Sequence
@@ -14,14 +14,14 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.validation import Interval, checked_fields
 
 CountFactor = Annotated[float, Interval(0, 10)]
-"""A factor on a detector's count."""
+"""A factor on a sensor's count."""
 
 
 @dataclass(frozen=True)
-class Detectors:
+class SensorSettings:
     """Errors of the fixed sensors beside the noise of the release, and their part of the budget.
 
-    A detector reports ``factor`` times what is released of it, plus a normal error whose standard
+    A sensor reports ``factor`` times what is released of it, plus a normal error whose standard
     deviation is ``absolute`` vehicles plus ``relative`` times the count. Of these, ``absolute`` and
     ``relative`` are known to the estimator, and ``factor`` is not.
 
@@ -48,21 +48,25 @@ class Detectors:
 
     def __post_init__(self) -> None:
         """Check values."""
-        checked_fields(self, "detectors")
+        checked_fields(self, "sensor_settings")
         if self.relative > 0.0 and self.absolute == 0.0:
             raise ValueError(
-                "detectors.absolute must be > 0 where detectors.relative is, or a count of zero "
-                f"vehicles would have no error, got {self.absolute:g}"
+                "sensor_settings.absolute must be > 0 where sensor_settings.relative is, or a "
+                f"count of zero vehicles would have no error, got {self.absolute:g}"
             )
 
     @property
     def are_exact(self) -> bool:
-        """True if detectors have no errors."""
-        return replace(self, budget_share=Detectors.budget_share) == Detectors()
+        """True if sensors have no errors."""
+        return replace(self, budget_share=SensorSettings.budget_share) == SensorSettings()
 
 
 def make_groups(
-    penetration: Penetration, detectors: Detectors, corridor: Corridor, *, private_boundary: bool
+    penetration: Penetration,
+    settings: SensorSettings,
+    corridor: Corridor,
+    *,
+    private_boundary: bool,
 ) -> tuple[Group, ...]:
     """Return the groups of channels.
 
@@ -72,31 +76,31 @@ def make_groups(
     add up to that of a connected vehicle (composition of Gaussian mechanisms); a vehicle that is
     not connected is seen by the fixed sensors alone and has their smaller parameter.
 
-    Where all vehicles are connected and detectors have no errors there is one group, and one
+    Where all vehicles are connected and sensors have no errors there is one group, and one
     ledger; without fixed sensors or private boundary segments the queries have the whole budget.
     """
-    if penetration.is_complete and detectors == Detectors():
+    if penetration.is_complete and settings == SensorSettings():
         return (Group("queries"),)
     if not (corridor.fixed_sensors or private_boundary):
         return (Group("queries", 1.0, penetration),)
-    share = detectors.budget_share
+    share = settings.budget_share
     if share is None:
         share = 1.0 / (1.0 + 3.0 * math.sqrt(penetration.published_share))
     return Group("queries", 1.0 - share, penetration), Group("sensors", share)
 
 
-class DetectorErrors:
+class SensorErrors:
     """Errors of the F fixed sensors in a batch of n episodes; they are no part of a release.
 
     They are drawn for every sensor and second, whatever is queried, from streams of their own. Who
     does not answer is not asked; what is released of the others has its guarantee before its error.
     """
 
-    def __init__(self, task: Task, detectors: Detectors) -> None:
+    def __init__(self, task: Task, settings: SensorSettings) -> None:
         """Prepare for episodes."""
-        self._detectors, self._channels = detectors, task.sensors
+        self._settings, self._channels = settings, task.sensors
         self._length, self._releases_flow = task.channels.length[task.sensors], task.releases_flow
-        self._factor = np.broadcast_to(np.array(detectors.factor, np.float64), task.sensors.shape)
+        self._factor = np.broadcast_to(np.array(settings.factor, np.float64), task.sensors.shape)
         self._streams: dict[int, np.random.Generator] = {}
 
     def reset(self, episodes: IntArray, generators: Sequence[np.random.Generator]) -> None:
@@ -105,7 +109,7 @@ class DetectorErrors:
 
     def answering(self, request: Request) -> Request:
         """Return a request without the sensors that do not answer in this second."""
-        silent = self._drawn(request.episodes, "random") < self._detectors.dropout
+        silent = self._drawn(request.episodes, "random") < self._settings.dropout
         observed: BoolArray = request.observed.copy()
         observed[:, self._channels] &= ~silent
         return request._replace(observed=observed)
@@ -113,9 +117,9 @@ class DetectorErrors:
     def added(self, episodes: IntArray, released: Measurement) -> Measurement:
         """Return a release with the errors of this second; mean speeds are not affected."""
         values, sigma = released.values.copy(), released.sigma.copy()
-        detectors, channels = self._detectors, self._channels
+        settings, channels = self._settings, self._channels
         density = values[:, channels, 0] * self._factor
-        error = detectors.absolute / self._length + detectors.relative * np.maximum(
+        error = settings.absolute / self._length + settings.relative * np.maximum(
             density, 0.0
         )  # [veh/km]
         values[:, channels, 0] = density + error * self._drawn(episodes, "standard_normal")

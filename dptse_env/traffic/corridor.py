@@ -179,7 +179,7 @@ class Corridor:
         recordings: imported traffic that episodes replay; None where SUMO simulates the traffic.
             With recordings the demand is a description of them, and there is no incident.
         fixed_sensors: indices of the segments measured at every step.
-        loops: loop detectors at borders of segments; None for none.
+        loops: stations of loops at borders of segments; None for none.
         measured: names of fields of the parts, and of keywords of an environment, whose values were
             measured on the records of this road, as imports and ``dptse fit`` write down. They void
             a guarantee for the vehicles of these records.

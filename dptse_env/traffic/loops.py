@@ -1,4 +1,4 @@
-"""Loop detectors: settings, and their stations on a road.
+"""Loops: settings, and their stations on a road.
 
 A loop is a point, unlike a fixed sensor: it sees what passes a border between two segments, and
 reports once an interval.
@@ -21,7 +21,7 @@ TOLERANCE = 0.001
 
 @dataclass(frozen=True)
 class Loops:
-    """Stations of loop detectors, one in each lane.
+    """Stations of loops, one in each lane.
 
     At the end of every interval of a record a station reports how many vehicles have passed it in
     the interval, and the arithmetic mean of their speeds.

@@ -1,4 +1,4 @@
-"""Readings of loop detectors, made of a record.
+"""Readings of loops, made of a record.
 
 A record has the segments of vehicles at whole seconds. A vehicle whose front is on one side of a
 station at a second and on the other side when it is seen next has passed it in the second that ends

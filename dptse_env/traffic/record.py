@@ -44,8 +44,8 @@ class Record:
     """Traffic on a road, second by second: a table of vehicles, or a measured field.
 
     Step k is the state of the road k seconds after the start. A table has at most one row for each
-    vehicle and step, and within a step it lists the vehicles segment by segment. A field, as from
-    detectors, has no rows. Columns are the S segments, then the R boundary segments.
+    vehicle and step, and within a step it lists the vehicles segment by segment. A measured
+    field has no rows. Columns are the S segments, then the R boundary segments.
 
     Attributes:
         n_steps: number of steps.

@@ -24,7 +24,7 @@ def test_the_heading_of_an_id_has_parameters_and_losses_alone():
         ('{"bandwidth": 1}', "bandwidth 1"),
         ('{"penetration": 0.3}', "penetration.share 0.3"),
         ('{"corridor": {"fixed_sensors": [0]}}', "corridor.fixed_sensors (0,)"),
-        ('{"detectors": {"absolute": 2}}', "detectors.absolute 2.0"),
+        ('{"sensor_settings": {"absolute": 2}}', "sensor_settings.absolute 2.0"),
         ('{"reward": "density"}', "reward density"),
         ('{"epsilon": 1}', "release model paced (epsilon 1, delta 0.05)"),
         ('{"privacy": {"preset": "capped", "cap": 16}}', "privacy.cap 16"),

@@ -267,11 +267,11 @@ def save(folder, delimiter=" ", **tables):
     return FieldSource(**paths, cell=0.1, interval=5.0, delimiter=delimiter.strip() or None)
 
 
-def test_zeros_while_detectors_were_off_are_gaps(tmp_path):
+def test_zeros_while_sensors_were_off_are_gaps(tmp_path):
     density, speed = traffic()
     expected = save(tmp_path, density=density, speed=speed).read(3, 100.0)[0]
     density[:, 20:23] = speed[:, 20:23] = 0.0  # all
-    with pytest.warns(UserWarning, match=r"in column\(s\) 21\.\.23, detectors were off: 36 zeros"):
+    with pytest.warns(UserWarning, match=r"in column\(s\) 21\.\.23, sensors were off: 36 zeros"):
         found, flow = save(tmp_path, density=density, speed=speed).read(3, 100.0)
     np.testing.assert_allclose(
         np.delete(found, slice(20, 23), 1), np.delete(expected, slice(20, 23), 1)
@@ -280,7 +280,7 @@ def test_zeros_while_detectors_were_off_are_gaps(tmp_path):
     assert flow.min() > 500.0
     density[4, 30:50] = speed[4, 30:50] = 0.0  # one, for 100 s
     message = (
-        r"row 5 must have a value every 60 s, got none from column 31 to 50 but zeros, as of det"
+        r"row 5 must have a value every 60 s, got none from column 31 to 50 but zeros, as of sen"
     )
     with pytest.raises(ValueError, match=message):
         save(tmp_path, density=density, speed=speed).read(3, 100.0)
@@ -295,12 +295,12 @@ def test_zeros_while_detectors_were_off_are_gaps(tmp_path):
 @pytest.mark.parametrize(
     "cells", [slice(3), slice(-3, None), slice(6, 12), slice(1, 12, 2), slice(1, 12)]
 )
-def test_detectors_that_are_off_beside_others_are_gaps(cells, kind, tmp_path):
+def test_sensors_that_are_off_beside_others_are_gaps(cells, kind, tmp_path):
     density, speed = traffic()
     tables = {"density": density, kind: speed if kind == "speed" else density * speed}
     for zero in ("density", kind):  # density alone at first: the other one contradicts it
         tables["density"][cells, 20:32] = tables[zero][cells, 20:32] = 0.0  # 60 s
-        told = f"detectors were off: {density[cells, 20:32].size} zeros"
+        told = f"sensors were off: {density[cells, 20:32].size} zeros"
         with pytest.warns(UserWarning, match=rf"in column\(s\) 21\.\.32, {told}"):
             found, flow = save(tmp_path, **tables).read(3, 100.0)
         assert found.min() > 50.0

@@ -1,4 +1,4 @@
-"""Loop detectors: readings, what they say of segments, and their place in the process."""
+"""Loops: readings, what they say of segments, and their place in the process."""
 
 import itertools
 import warnings

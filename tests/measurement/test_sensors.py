@@ -1,4 +1,4 @@
-"""Connected vehicles and fixed sensors: groups of channels, and the errors of detectors."""
+"""Connected vehicles and fixed sensors: groups of channels, and errors of the latter."""
 
 import dataclasses
 import math
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.measurement import Detectors, make_groups
+from dptse_env.measurement import SensorSettings, make_groups
 from dptse_env.parts import make_release, privacy_report
 from dptse_env.privacy import mu_of
 from dptse_env.process import QueryProcess
@@ -84,21 +84,21 @@ def test_groups_are_queries_and_sensors_with_their_parts_of_the_budget():
         assert [group.population for group in groups][1:] in ([], [None])
         return {group.name: group.budget_share for group in groups}
 
-    assert shares(some, Detectors(), road) == pytest.approx({"queries": 0.6, "sensors": 0.4})
-    assert shares(Penetration(), Detectors(budget_share=0.1), road)["sensors"] == 0.1
-    assert shares(some, Detectors(), bare) == {"queries": 1.0}
-    assert set(shares(some, Detectors(), bare, private=True)) == {"queries", "sensors"}
+    assert shares(some, SensorSettings(), road) == pytest.approx({"queries": 0.6, "sensors": 0.4})
+    assert shares(Penetration(), SensorSettings(budget_share=0.1), road)["sensors"] == 0.1
+    assert shares(some, SensorSettings(), bare) == {"queries": 1.0}
+    assert set(shares(some, SensorSettings(), bare, private=True)) == {"queries", "sensors"}
     for all_connected in ({}, {"penetration": 1.0}, {"penetration": {"seed": 4}}):
         process = QueryProcess(resolve("short-highway", all_connected))
         assert process.release.task.groups == (Group("queries"),)
-        assert (process.fusion, process.detectors) == (None, None)
+        assert (process.fusion, process.sensor_errors) == (None, None)
         assert "groups" not in process.release.report().to_dict()
 
 
 def test_a_model_that_knows_of_no_groups_is_refused_before_anything_is_recorded():
     for keywords, message in (
         ({"penetration": 0.5}, r"penetration\.share must be 1"),
-        ({"detectors": {"dropout": 0.1}}, "detectors must be left out"),
+        ({"sensor_settings": {"dropout": 0.1}}, "sensor_settings must be left out"),
     ):
         with pytest.raises(ValueError, match=rf"^{message} with the release model .*SumRelease'"):
             resolve("short-highway", {"privacy": SumRelease, **keywords})
@@ -130,7 +130,7 @@ def test_queries_count_connected_vehicles_and_sensors_all_in_columns_of_their_ow
     ("preset", "asked"), [("capped", None), ("capped", 0.1), ("paced", None), ("paced", 0.6)]
 )
 def test_squared_parameters_of_groups_add_up_and_the_report_names_each(preset, asked):
-    keywords = {"detectors": {"budget_share": asked}} if asked else {}
+    keywords = {"sensor_settings": {"budget_share": asked}} if asked else {}
     config = resolve("private-highway", {"penetration": 0.1, "privacy": preset, **keywords})
     whole, report = mu_of(config.privacy.epsilon, config.privacy.delta), privacy_report(config)
     assert report.mu == pytest.approx(whole, rel=1e-12)
@@ -172,11 +172,11 @@ def test_what_is_spent_grows_to_mu_by_the_largest_charges_of_both_groups(preset)
 
 
 @pytest.mark.parametrize(
-    ("preset", "detectors"),
+    ("preset", "errors"),
     pairwise(PRESETS, [{}, {"dropout": 0.3, "absolute": 0.5}], n=4, rest=False),
 )
-def test_a_fork_gives_the_bits_of_its_origin_and_leaves_it_alone(preset, detectors):
-    process = begun(preset, detectors=detectors)
+def test_a_fork_gives_the_bits_of_its_origin_and_leaves_it_alone(preset, errors):
+    process = begun(preset, sensor_settings=errors)
     play(process, 5)
     fork = process.fork()
     ahead, again = ([measured.values for *_, measured in play(each, 5)] for each in (fork, process))
@@ -197,18 +197,20 @@ def test_given_noise_reaches_both_groups():
 
 def test_a_batch_is_so_many_scalar_environments():
     """Ledgers among their infos, too, which differ in length from record to record."""
-    keywords = {"penetration": SHARE, "detectors": {"dropout": 0.3, "absolute": 0.5}}
+    keywords = {"penetration": SHARE, "sensor_settings": {"dropout": 0.3, "absolute": 0.5}}
     lock_step({"privacy": "paced", "truth_in_info": True, **keywords}, 8)
 
 
-# --- detectors ---------------------------------------------------------------------------------
+# --- errors of fixed sensors ---------------------------------------------------------------------
 
 
-def test_an_error_of_a_detector_changes_what_it_measures_alone_and_no_release():
+def test_an_error_of_a_sensor_changes_what_it_measures_alone_and_no_release():
     """Noise comes from a stream of its own: that of releases is the same with errors or without."""
     exact, doubled, noisy = (
         play(
-            begun("corrected", detectors={"budget_share": 0.4, **error}, estimator="open_loop"),
+            begun(
+                "corrected", sensor_settings={"budget_share": 0.4, **error}, estimator="open_loop"
+            ),
             BLOCK + 2,  # the second block of noise as well
         )
         for error in ({}, {"factor": [2.0, 1.0, 1.0]}, {"absolute": 1.0})
@@ -225,8 +227,8 @@ def test_an_error_of_a_detector_changes_what_it_measures_alone_and_no_release():
         assert (wrong.values[0, COLUMNS, 0] != good.values[0, COLUMNS, 0]).all()
 
 
-def test_a_silent_detector_is_not_observed_and_charges_nobody():
-    process = begun(detectors={"dropout": 0.9}, truth_in_info=True)
+def test_a_silent_sensor_is_not_observed_and_charges_nobody():
+    process = begun(sensor_settings={"dropout": 0.9}, truth_in_info=True)
     often = begun(truth_in_info=True)
     found = play(process, 40)
     play(often, 40)
@@ -241,7 +243,7 @@ def test_a_silent_detector_is_not_observed_and_charges_nobody():
 @pytest.mark.parametrize("preset", ["corrected", "paced"])
 def test_errors_are_as_large_as_the_deviation_of_the_measurement_says(preset):
     """Flows have the factor alone, mean speeds nothing; the factor is in no deviation."""
-    process = begun(preset, detectors={"absolute": 2.0, "relative": 0.5, "factor": 1.5})
+    process = begun(preset, sensor_settings={"absolute": 2.0, "relative": 0.5, "factor": 1.5})
     errors = []
     for released, _, measured in play(process, 60):
         values, sigma = measured.values[0, COLUMNS], measured.sigma[0, COLUMNS]
@@ -257,12 +259,12 @@ def test_errors_are_as_large_as_the_deviation_of_the_measurement_says(preset):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"detectors": {"relative": 0.1}}, "detectors.absolute must be > 0"),
-        ({"detectors": {"dropout": 1.0}}, "detectors.dropout must be"),
-        ({"detectors": {"factor": [1.0, 1.0, 1.0]}}, "one for each of the 2 fixed sensors"),
+        ({"sensor_settings": {"relative": 0.1}}, "sensor_settings.absolute must be > 0"),
+        ({"sensor_settings": {"dropout": 1.0}}, "sensor_settings.dropout must be"),
+        ({"sensor_settings": {"factor": [1.0, 1.0, 1.0]}}, "one for each of the 2 fixed sensors"),
         (
-            {"detectors": {"dropout": 0.1}, "corridor": {"fixed_sensors": []}},
-            "detectors must be left out on a road without fixed sensors",
+            {"sensor_settings": {"dropout": 0.1}, "corridor": {"fixed_sensors": []}},
+            "sensor_settings must be left out on a road without fixed sensors",
         ),
         ({"fusion": {"dwell_factor": -1.0}}, "fusion.dwell_factor must be"),
     ],
@@ -272,7 +274,7 @@ def test_bad_sensors_are_refused_by_path(keywords, message):
         resolve("short-highway", keywords)
 
 
-def test_detectors_without_errors_are_exact():
-    assert Detectors().are_exact
-    assert Detectors(budget_share=0.5).are_exact
-    assert not Detectors(factor=1.1).are_exact
+def test_sensors_without_errors_are_exact():
+    assert SensorSettings().are_exact
+    assert SensorSettings(budget_share=0.5).are_exact
+    assert not SensorSettings(factor=1.1).are_exact

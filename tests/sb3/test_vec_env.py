@@ -157,7 +157,7 @@ def groups_of(env, value):
     ("seed", "keywords"),
     [
         (5, {}),
-        (None, {"estimator": "enkf", "detectors": {"dropout": 0.1}}),
+        (None, {"estimator": "enkf", "sensor_settings": {"dropout": 0.1}}),
         (5, {"action": "sequential", "privacy": SumRelease, "query_spans": (1, 2), "bandwidth": 3}),
     ],
 )

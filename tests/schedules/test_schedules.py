@@ -110,7 +110,7 @@ def test_a_segment_with_a_fixed_sensor_is_queried_last(name):
 
 # --- schedules of the process ---------------------------------------------------------------------
 
-LEFT_ALONE = [{"penetration": 0.3, "detectors": {"dropout": 0.5}},
+LEFT_ALONE = [{"penetration": 0.3, "sensor_settings": {"dropout": 0.5}},
               {"privacy": COUNTED, "estimator": "enkf"}]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Settings of loop detectors: borders, warnings, refusals and road files."""
+"""Settings of loops: borders, warnings, refusals and road files."""
 
 import json
 import math

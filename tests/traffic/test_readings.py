@@ -1,4 +1,4 @@
-"""Readings of loop detectors: those of SUMO's own, and of vehicles that are hard to follow."""
+"""Readings of loops: those of SUMO's own, and of vehicles that are hard to follow."""
 
 from types import SimpleNamespace
 from xml.etree import ElementTree
