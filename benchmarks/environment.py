@@ -1,7 +1,7 @@
 """Time of an environment's step beside SUMO's second, Gymnasium's vectorisation and sumo-rl.
 
 A step is a second of one episode with the EKF; sumo-rl's takes five seconds, so its time of a
-second is a fifth of it. Beside loops intervals of 20 s are lived through again.
+second is a fifth of it. Beside loops the estimator is rewound every 20 s.
 """
 
 from __future__ import annotations

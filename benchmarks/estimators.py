@@ -46,7 +46,7 @@ def tapped_calls(env: SensorQueryVectorEnv, n_steps: int) -> list[Call]:
     return calls
 
 
-def replaying(
+def repeating(
     name: str, backend: str, env: SensorQueryVectorEnv, calls: list[Call], n_steps: int
 ) -> Work:
     """Return work in which another estimator repeats calls, some steps in each turn."""
@@ -76,12 +76,12 @@ def measure(*, quick: bool = False) -> list[Row]:
     work, bases = {}, {}
     for name in (*REFERENCES, "recurrent", "asm"):
         label, own = LABELS[name], {}
-        work[label] = replaying(name, "compiled", alone, calls, block)
-        own[f"{label}, batch of {n_batch}"] = replaying(
+        work[label] = repeating(name, "compiled", alone, calls, block)
+        own[f"{label}, batch of {n_batch}"] = repeating(
             name, "compiled", batch, calls_of_batch, block
         )
         if name in REFERENCES:
-            own[f"{label}, {REFERENCES[name]}"] = replaying(name, "reference", alone, calls, block)
+            own[f"{label}, {REFERENCES[name]}"] = repeating(name, "reference", alone, calls, block)
         work |= own
         bases |= dict.fromkeys(own, label)
     return compare(take_turns(work, rounds), bases)

@@ -8,7 +8,7 @@ as long is linear growth.
 from __future__ import annotations
 
 from agents.figures import LABELS
-from benchmarks.estimators import replaying, tapped_calls
+from benchmarks.estimators import repeating, tapped_calls
 from benchmarks.turns import Row, compare, make_batch, take_turns
 from dptse_env.traffic import Conditions, Corridor, Demand, Geometry, Incident, Scales
 
@@ -58,7 +58,7 @@ def measure(*, quick: bool = False) -> list[Row]:
         calls = tapped_calls(env, n_steps)
         for name in ESTIMATORS:
             what, base = (f"{LABELS[name]}, {each} segments" for each in (n, lengths[0]))
-            work[what] = replaying(name, "compiled", env, calls, block)
+            work[what] = repeating(name, "compiled", env, calls, block)
             if what != base:
                 bases[what] = base
     return compare(take_turns(work, rounds), bases)

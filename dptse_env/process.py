@@ -17,7 +17,7 @@ from dptse_env.measurement import (
     BOUNDARIES,
     Fusion,
     LoopReadings,
-    Replay,
+    Rewind,
     SensorErrors,
     nominal_state,
 )
@@ -78,7 +78,7 @@ class QueryProcess:
         sensor_errors: Errors of the fixed sensors; None where they have none.
         fusion: Turns releases into measurements of all vehicles; None where they are these.
         loops: Readings of loops; None where there are none.
-        replay: Takes the estimator back to where an interval began, with its readings; None where
+        rewind: Takes the estimator back to where an interval began, with its readings; None where
             there are no loops.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
@@ -137,10 +137,10 @@ class QueryProcess:
         is_fused = config.has_separate_sensors
         self.fusion = Fusion(task, config.fusion, share) if is_fused else None
         self._threads = EpisodeThreads(threads if self.estimator.is_compiled else 1)
-        self.loops, self.replay = None, None
+        self.loops, self.rewind = None, None
         if config.corridor.loops is not None:
             self.loops = LoopReadings(task, self.traffic)
-            self.replay = Replay(self.loops, self.estimator, task, self._threads)
+            self.rewind = Rewind(self.loops, self.estimator, task, self._threads)
         self._checks_estimates = is_foreign(self.estimator)
         self._checks_releases = is_foreign(self.release)
         self._checks_decisions = is_foreign(self.interface.actions)
@@ -216,8 +216,8 @@ class QueryProcess:
         self.boundary.reset(episodes)
         prior = nominal_state(self.config.corridor, self.model, self.time[episodes])
         self.estimator.reset(episodes, prior, for_estimator)
-        if self.replay is not None:
-            self.replay.begin(episodes, starts)
+        if self.rewind is not None:
+            self.rewind.begin(episodes, starts)
         self.queried[episodes] = False
         self.n_dropped[episodes] = 0
         self.age[episodes] = AGE_CAP
@@ -285,8 +285,8 @@ class QueryProcess:
         measured = self.measure(request)
         self.boundary.update(episodes, measured)
         self._threads.run(self.estimator.update, episodes, measured, Measurement.at)
-        if self.replay is not None:
-            self.replay.follow(episodes, traffic, self.time[episodes], inputs, measured)
+        if self.rewind is not None:
+            self.rewind.follow(episodes, traffic, self.time[episodes], inputs, measured)
         self.queried[own] = queried
         rows = slice(self.released.shape[1])
         answered = measured.observed[:, rows, None]

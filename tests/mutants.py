@@ -744,7 +744,7 @@ MUTANTS = (
         "test_non_interference.py",
     ),
     Mutant(
-        "a reading comes before its interval", 25, "measurement/replay.py",
+        "a reading comes before its interval", 25, "measurement/rewind.py",
         "self._loops.said_until(traffic, times)",
         "self._loops.said_until(traffic, np.minimum(times + self._loops.interval, 42))",
         "test_non_interference.py",
@@ -790,9 +790,9 @@ MUTANTS = (
     ),
     Mutant(
         "vehicles pay for loops", 25, "process.py",
-        "if self.replay is not None:\n            self.replay.follow(",
-        "if self.replay is not None:\n            self.release.ledgers.paid[episodes] += 1.0; "
-        "self.replay.follow(",
+        "if self.rewind is not None:\n            self.rewind.follow(",
+        "if self.rewind is not None:\n            self.release.ledgers.paid[episodes] += 1.0; "
+        "self.rewind.follow(",
         "test_guarantee.py",
     ),
     Mutant(

@@ -136,7 +136,7 @@ def _tried(
     n, every = len(shown), np.arange(len(shown))
     columns = before.release.task.n_channels
     noise = generator.choice([-1.0, 1.0], size=(n, columns, 2))
-    reward, spent = _replayed(before, actions, noise)
+    reward, spent = _played(before, actions, noise)
     queried = np.zeros((n, before.interface.queries.n_queries), dtype=bool)
     np.put_along_axis(queried, actions[0], True, axis=1)
     parts = []
@@ -145,7 +145,7 @@ def _tried(
         place = generator.integers(actions[0].shape[1], size=n)
         query = actions[0].copy()
         query[every, place] = added
-        swapped_reward, swapped_spent = _replayed(before, [query, *actions[1:]], noise)
+        swapped_reward, swapped_spent = _played(before, [query, *actions[1:]], noise)
         dropped = actions[0][every, place]
         gain, increase = swapped_reward - reward, swapped_spent - spent
         parts.append((n * n_before + every, added, dropped, gain, increase))
@@ -153,7 +153,7 @@ def _tried(
     return shown, -reward / len(actions), *swaps
 
 
-def _replayed(
+def _played(
     before: QueryProcess, actions: Sequence[Action], noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the summed reward of each episode and the budgets that its vehicles have spent then.

@@ -3,7 +3,7 @@
 from dptse_env.measurement.boundary import BOUNDARIES, BoundaryModel, nominal_state
 from dptse_env.measurement.fusion import Fusion, FusionSettings
 from dptse_env.measurement.loops import LoopReadings
-from dptse_env.measurement.replay import Replay
+from dptse_env.measurement.rewind import Rewind
 from dptse_env.measurement.sensors import SensorErrors, SensorSettings, make_groups
 
 __all__ = [
@@ -12,7 +12,7 @@ __all__ = [
     "Fusion",
     "FusionSettings",
     "LoopReadings",
-    "Replay",
+    "Rewind",
     "SensorErrors",
     "SensorSettings",
     "make_groups",

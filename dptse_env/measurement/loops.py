@@ -1,7 +1,7 @@
 """Loops: what their readings say of the segments beside them.
 
 Readings are public before the releases and no part of any budget. A reading comes at the end of its
-interval and is told in the middle of it: `dptse_env.measurement.replay`. Were it told in every
+interval and is told in the middle of it: `dptse_env.measurement.rewind`. Were it told in every
 second, with errors that are alike, estimators would take its noise for what traffic did.
 """
 

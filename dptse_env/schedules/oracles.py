@@ -86,19 +86,19 @@ class OracleGain(ProcessSchedule):
         measured = ahead.measure(request)
         truth = ahead.traffic.aggregates(traffic, times + 1)[:, :n]
         density, speed = truth[..., 0], truth[..., 1]
-        shared = [ahead.estimator.model, *(ahead.replay.shared if ahead.replay else ())]
+        shared = [ahead.estimator.model, *(ahead.rewind.shared if ahead.rewind else ())]
         rewards = np.empty((len(episodes), n))
         for segment in range(n):
             queried = np.zeros((len(episodes), n), dtype=bool)
             queried[:, segment] = True
             seen = ahead.release.task.observed(queried) & measured.observed
-            estimator, replay = copy.deepcopy(
-                (ahead.estimator, ahead.replay), {id(part): part for part in shared}
+            estimator, rewind = copy.deepcopy(
+                (ahead.estimator, ahead.rewind), {id(part): part for part in shared}
             )
             given = measured._replace(observed=seen)
             estimator.update(episodes, given)
-            if replay is not None:
-                replay.follow(episodes, traffic, times + 1, inputs, given)
+            if rewind is not None:
+                rewind.follow(episodes, traffic, times + 1, inputs, given)
             estimate = estimator.estimate().at(episodes)
             error = estimation_error(density, speed, estimate.density[:, :n], estimate.speed[:, :n])
             rewards[:, segment] = self.interface.reward(

@@ -1,4 +1,4 @@
-"""Replay: an estimator that lives through intervals again, in every use of the process."""
+"""Rewind: an estimator that goes through intervals again, in every use of the process."""
 
 import copy
 import pickle
@@ -54,7 +54,7 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_time(estimator, priva
     """At each interval's end, bit for bit, but for what it says of the releases of this second."""
     process = begun(estimator=estimator, privacy=privacy)
     by_hand, given = copy.deepcopy(process.estimator), {e: [] for e in ALL.tolist()}
-    kept = process.replay.follow
+    kept = process.rewind.follow
 
     def spy(episodes, traffic, times, inputs, measured):
         for k, episode in enumerate(episodes.tolist()):
@@ -64,7 +64,7 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_time(estimator, priva
             given[episode].append((inputs[k : k + 1].copy(), own))
         kept(episodes, traffic, times, inputs, measured)
 
-    process.replay.follow = spy
+    process.rewind.follow = spy
     n_ends = 0
     for action in sampled(process, 30):
         process.step(ALL, action)
@@ -154,7 +154,7 @@ def test_a_reading_is_no_query(estimator):
         np.testing.assert_array_equal(innovations[early], without.estimator.innovations[early])
 
 
-def test_a_filter_that_starts_over_in_a_replay_says_so():
+def test_a_filter_that_starts_over_in_a_rewind_says_so():
     process = begun(privacy="printed")
     actions, added = sampled(process, T), process.loops.added
 
@@ -308,8 +308,8 @@ def test_one_state_is_kept_for_an_interval_and_little_more(preset):
     loops = {"positions": [0.0, 0.5, 1.0], "interval": 20}
     config = resolve(preset, {"traffic_seeds": [0], "loops": loops, "estimator": "ekf"})
     process = QueryProcess(config, 4)
-    (log,) = process.replay._log.parts
-    kept = bytes_of(process.replay._kept) + bytes_of(log)
+    (log,) = process.rewind._log.parts
+    kept = bytes_of(process.rewind._kept) + bytes_of(log)
     assert kept < 2 * bytes_of(process.estimator.memory)
 
 

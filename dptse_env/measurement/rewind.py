@@ -1,4 +1,4 @@
-"""Replay: an estimator lives through an interval again, with what is known at its end.
+"""Rewind: an estimator goes through an interval again, with what is known at its end.
 
 A reading of an interval belongs to its middle. So the estimator's state is kept once an interval,
 and what it was given since: inputs, and the numbers of the channels that were observed. When the
@@ -23,11 +23,11 @@ BLOCK = 1024
 """Measurements that are put together at a time; more of them cost memory, fewer of them time."""
 
 
-class Replay:
+class Rewind:
     """The present interval of each of n episodes.
 
     `Estimator.innovations` stay those of what was released, and `Estimator.diverged` and
-    `Estimator.fallback` say so if it happened in any second that was lived through again.
+    `Estimator.fallback` say so if it happened in any second of the second pass.
 
     Attributes:
         estimator: The estimator, which it takes back and forward again.
@@ -83,7 +83,7 @@ class Replay:
         inputs: FloatArray,
         measured: Measurement,
     ) -> None:
-        """Keep what the estimator was given in a second, and replay the intervals that end.
+        """Keep what the estimator was given in a second, and rewind where an interval ends.
 
         Args:
             episodes: Shape (k,).
@@ -98,7 +98,7 @@ class Replay:
             self._threads.run(self._again, episodes[ends], (traffic[ends], times[ends]), _block_of)
 
     def _again(self, episodes: IntArray, place: tuple[IntArray, IntArray]) -> None:
-        """Live through the interval that ends of episodes (k,) again, with its readings.
+        """Go through the interval that ends of episodes (k,) again, with its readings.
 
         Args:
             episodes: Shape (k,).
