@@ -1,10 +1,10 @@
 """An estimator on a road, with whatever its sensors say: a door for a stream of one's own.
 
-A reading of a station counts in the middle of its interval, and what others say in every second of
-theirs. The estimator keeps some of its past states,
-and goes back to the interval's beginning and forward again, so that readings of a second or of ten
-minutes, in time or late, are one case. Sources of the same second and segment are put together by
-their variances. What nobody saw is as predicted.
+A reading of a station counts in the middle of its interval, and what other sources say in every
+second of theirs. The estimator keeps some of its past states. It goes back to the beginning of an
+interval and forward again, so that readings of a second or of ten minutes, in time or late, are one
+case. Sources of the same second and segment are put together by their variances. What nobody saw is
+as predicted.
 """
 
 from __future__ import annotations
@@ -72,8 +72,9 @@ class RoadEstimator:
     """An estimator on a road, second by second, from whatever came in.
 
     Ends of the road and of its ramps have the traffic that sources beside them said last, within
-    ten minutes. Where none did, vehicles enter at the demand that the road file publishes, whose
-    first second is the stream's and whose last one goes on, and behind exits it is as before them.
+    ten minutes. Where none did, vehicles enter at the demand that the road file publishes. Its
+    first second is the stream's, and its last one goes on. Behind an exit that nobody sees, traffic
+    is as before it.
 
     Attributes:
         corridor: The road.

@@ -2,7 +2,7 @@
 
 A reading of an interval belongs to its middle. So the estimator's state is kept once an interval,
 and what it was given since: inputs, and the numbers of the channels that were observed. When the
-readings come, it goes back and takes them in the seconds `seconds_told` of the interval.
+readings come, it goes back to that state, and takes them in the seconds `seconds_told`.
 """
 
 from __future__ import annotations
