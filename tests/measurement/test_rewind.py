@@ -100,7 +100,7 @@ def test_what_is_known_of_a_segment_in_a_second_is_weighed_by_its_variance(priva
     untold = loops.added(measured, said, np.array([4, 6]))
     for own, other in zip(untold, measured, strict=True):
         np.testing.assert_array_equal(own, other)
-    beside = np.unique(loops.stations.beside)
+    beside = np.unique(task.corridor.stations.beside)
     rest = np.setdiff1d(np.arange(task.n_channels), beside)
     for own, other in zip(given[:3], measured[:3], strict=True):
         np.testing.assert_array_equal(own[:, rest], other[:, rest])
