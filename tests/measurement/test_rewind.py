@@ -363,7 +363,7 @@ def test_an_estimator_of_another_package_goes_back_by_what_it_remembers():
     before = process.estimate.density[0].copy()
     process.step(ALL, nothing)
     fixed = list(process.config.corridor.fixed_sensors)
-    beside = np.unique(process.loops.stations.beside)
+    beside = np.unique(process.config.corridor.stations.beside)
     said = process.loops.said(process.traffic.readings[process.traffic_index[:1], [0]])
     unseen = np.setdiff1d(np.arange(8), [*beside, *fixed])
     np.testing.assert_allclose(process.estimate.density[0, unseen], before[unseen] + 0.1)
