@@ -35,7 +35,7 @@ CAPPED, PACED = {"preset": "capped", "cap": 5}, {"preset": "paced", "epsilon": 0
     ("privacy", "claim", "settings"),
     [
         (CAPPED, "0.75032-Gaussian differential privacy, which is (1, 0.05)-", {"cap": 5}),
-        (PACED, "0.49184-Gaussian differential privacy, which is (0.5, 0.05)-", {"pace": 0.85}),
+        (PACED, "0.49184-Gaussian differential privacy, which is (0.5, 0.05)-", {"clip": 25.0}),
     ],
 )
 def test_the_account_is_in_info_and_grows_up_to_the_guarantee(privacy, claim, settings):
@@ -96,7 +96,7 @@ def test_what_vehicles_have_spent_is_shown_with_the_truth(privacy, what, most):
 
 def test_a_spec_with_every_keyword_of_paced_ledgers_survives_json():
     privacy = {
-        "epsilon": 2.0, "delta": 0.01, "unit": "event", "adjacency": "add_remove", "pace": 0.6,
+        "epsilon": 2.0, "delta": 0.01, "unit": "event", "adjacency": "add_remove",
         "clip": 25.0, "ratio": 3.0, "boundary_inputs": "private",
     }  # fmt: skip
     given = {"privacy": privacy, "traffic_seeds": "0:2", "horizon": 20}

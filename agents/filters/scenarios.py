@@ -37,8 +37,8 @@ EPSILONS, CAPS = (0.5, 20.0), (24, 128)
 """Ranges of epsilon, and of the cap of ``capped``; drawn log-uniformly."""
 DELTAS = (0.05, 0.001)
 """Values of delta."""
-CLIPS, PACES = (18.0, 51.0), (0.7, 0.95)
-"""Ranges of the clip [km/h] and of the pace of ``paced``."""
+CLIPS = (18.0, 51.0)
+"""Range of the clip of ``paced`` [km/h]."""
 
 
 def _road(**keywords: Any) -> str:
@@ -219,5 +219,4 @@ def _draw_privacy(rng: np.random.Generator, mechanism: str) -> dict[str, Any]:
         privacy["cap"] = int(np.exp(rng.uniform(*np.log(CAPS))))
     elif mechanism == "paced":
         privacy["clip"] = round(float(rng.uniform(*CLIPS)), 1)
-        privacy["pace"] = round(float(rng.uniform(*PACES)), 3)
     return privacy

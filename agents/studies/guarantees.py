@@ -124,7 +124,7 @@ def priced(estimator: str, protection: str = TRIP, **changes: Any) -> Cell:
 
 SETTINGS: dict[str, Any] = {
     "epsilon": 5.0, "delta": DELTA, "adjacency": "replace", "unit": "trip",
-    "pace": 0.85, "clip": 25.0, "ratio": 1.0,
+    "clip": 25.0, "ratio": 1.0,
 }  # fmt: skip
 """Privacy settings of a cell of the ledgers, but for what it varies."""
 BASE = SETTINGS | {
@@ -133,8 +133,8 @@ BASE = SETTINGS | {
 }  # fmt: skip
 LACKS = {
     "paced": (),
-    "capped": ("pace", "clip", "ratio"),
-    "exact": ("epsilon", "delta", "adjacency", "unit", "pace", "ratio"),
+    "capped": ("clip", "ratio"),
+    "exact": ("epsilon", "delta", "adjacency", "unit", "ratio"),
 }
 """Value of a setting that a release model does not have."""
 QUERIES: dict[str, dict[str, Any]] = {
@@ -350,9 +350,8 @@ CLAIMED_NOTE = (
 LEDGER_NOTE = (
     f"Where a table does not say otherwise: (ε, δ) = (5, {DELTA:g}) for a whole trip that is "
     "replaced by another, nominal boundary inputs, 5 segments a second, schedule `round-robin`, "
-    "the EKF, and for `paced` a pace of 0.85, a clip of 25 km/h and a ratio of "
-    "1. *Refused*: contributions that a cap or a ledger did not cover, known from the true traffic "
-    "and for evaluation alone."
+    "the EKF, and for `paced` a clip of 25 km/h and a ratio of 1. *Refused*: contributions that a "
+    "cap or a ledger did not cover, known from the true traffic and for evaluation alone."
 )
 
 # Figures, each drawn where all of its cells were played

@@ -45,7 +45,6 @@ class PacedSettings(PrivacySettings):
         unit: Unit of protection: ``trip``, all of a vehicle's trip that an episode covers;
             ``event``, one second of a trip.
         adjacency: Difference of two adjacent records: ``replace`` or ``add_remove``.
-        pace: Part of the budget that the pacing tries to have spent at the end of a trip.
         clip: Largest deviation D of a speed from its centre that is released [km/h]; larger ones
             are clipped.
         ratio: Ratio r of the charge for a deviation of D and the charge for being counted; noise
@@ -61,7 +60,6 @@ class PacedSettings(PrivacySettings):
     preset: Any = "paced"
     unit: PacedUnit = "trip"
     adjacency: Adjacency = "replace"
-    pace: Annotated[float, Interval(0.05, 1)] = 0.85
     clip: Annotated[float, Interval(1, 200)] = 25.0
     ratio: Annotated[float, Interval(0.01, 100)] = 1.0
 
@@ -243,7 +241,6 @@ class Paced(ReleaseModel):
             details={
                 "unit": settings.unit,
                 "adjacency": settings.adjacency,
-                "pace": settings.pace,
                 "clip": settings.clip,
                 "ratio": settings.ratio,
                 **task.group_reports(self.mu, self._expected_std),

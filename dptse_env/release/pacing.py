@@ -19,17 +19,14 @@ from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
 from dptse_env.utils.units import HOUR
 
-MEAN_SQUARE = 0.15
-"""Expected value of d^2 / D^2, by which a contribution costs more than its price."""
+CHARGED_SQUARE = 0.5
+"""Value of d^2 / D^2 for which pacing has vehicles pay. Most pay less, so that few run out."""
 
 LEAST_SHARE = 0.01
 """Least part of the budget that is offered for the rest of a trip, so that prices stay positive."""
 
 SLOWEST_TRIP, FASTEST_TRIP = 8.0, 102.0
 """Range that predicted speeds [km/h] are held to where they give the time of a trip."""
-
-MARGIN = 2.0
-"""Queried seconds added to those that are expected for the rest of a trip [s]."""
 
 RATE_MEMORY = 60.0
 """Time constant of the average by which rates of querying follow the queries [s]."""
@@ -80,24 +77,23 @@ class Pacing(ABC):
 
 
 class Paces(NamedTuple):
-    """Offers of a `TripPacing`, and its public state of n episodes."""
+    """Budgets of a `TripPacing`, and its public state of n episodes."""
 
-    offered: FloatArray  # (groups,) part of each group's budget that a trip should spend
-    least: FloatArray  # (groups,) least that is offered for the rest of a trip
-    charge: float  # expected payment over the price
+    budget: FloatArray  # (groups,)
+    ratio: float
     rates: FloatArray  # (n, groups, cells) of querying
-    spent: FloatArray  # (n, groups, cells) expected payments so far
+    spent: FloatArray  # (n, groups, cells) what most have paid so far at most
 
 
 class TripPacing(Pacing):
     """Prices for the unit ``trip``: they spend what is left of a budget evenly over its rest.
 
-    The mean m that vehicles on a segment have spent is predicted: a query adds its expected charge,
-    ``a (1 + 0.15 r)``, predicted flows carry it along, and vehicles enter with 0. The rest
-    of a trip has R queried seconds: the sum, over the segments from here on, of the rate of
-    querying times the length over the predicted speed, which is held to [8, 102] km/h, and a margin
-    of 2 s. The price on a segment is ``max(pace b - m, 0.01 b) / R``, and that of a query the mean
-    over its segments.
+    What most vehicles on a segment have spent at most, m, is predicted: a query adds
+    ``a (1 + 0.5 r)``, predicted flows carry it along, and vehicles enter with 0. The rest of a trip
+    has R queried seconds: the sum, over the segments from here on, of the rate of querying times
+    the length over the predicted speed, which is held to [8, 102] km/h, and ``1 + r``. The price on
+    a segment is ``max(b - m, 0.01 b) / R``, and that of a query the mean over its segments. So
+    whoever has spent at most m of a budget b can pay for a query at any deviation.
 
     Rates of querying are averages over the last minute or so. They begin at equal rates for all
     segments, so that a policy that keeps querying the same cell is soon paced for that.
@@ -111,9 +107,8 @@ class TripPacing(Pacing):
         mainline = self._first_rates[0, : task.corridor.geometry.n_mainline]
         mainline[:] = np.maximum(mainline, _coverage(task.queries))
         self._paces = Paces(
-            offered=task.settings.pace * budget,
-            least=LEAST_SHARE * budget,
-            charge=1.0 + MEAN_SQUARE * task.settings.ratio,
+            budget=budget,
+            ratio=task.settings.ratio,
             rates=np.tile(self._first_rates, (task.n_episodes, 1, 1)),
             spent=np.zeros((task.n_episodes, *self._first_rates.shape)),
         )
@@ -137,8 +132,8 @@ class TripPacing(Pacing):
         road = self.task.corridor.road
         n, length = road.n_mainline, road.lengths[: road.n_mainline]
         seconds = HOUR * length / np.clip(speed[:n], SLOWEST_TRIP, FASTEST_TRIP)
-        queried = (self._first_rates[:, :n] * seconds).sum(axis=1) + MARGIN
-        prices: FloatArray = self._paces.offered / queried
+        queried = (self._first_rates[:, :n] * seconds).sum(axis=1)
+        prices: FloatArray = self.budget / (queried + 1.0 + self._paces.ratio)
         return prices
 
     def spent_share(self, episodes: IntArray) -> FloatArray:
@@ -201,17 +196,17 @@ def _pace(
         prices: Output, shape (k, C).
     """
     road, channels, paces = bundle.parts
-    offered, least, charge = paces.offered, paces.least, paces.charge
-    rates, spent = paces.rates, paces.spent
+    rates, spent, largest = paces.rates, paces.spent, 1.0 + paces.ratio
+    charge = 1.0 + CHARGED_SQUARE * paces.ratio
     n_groups, n_cells = spent.shape[1], spent.shape[2]
     rest, before, charged = np.empty(n_cells), np.empty(n_cells), np.empty(n_cells)
     inflow = np.empty((2, road.n_segments))
     for k in range(episodes.size):
         for g in range(n_groups):
-            paid, rate = spent[episodes[k], g], rates[episodes[k], g]
+            paid, rate, budget = spent[episodes[k], g], rates[episodes[k], g], paces.budget[g]
             copy_vector(paid, before)
             _carry(road, density[k], speed[k], before, paid, inflow)
-            _remaining(road, speed[k], rate, rest)
+            _remaining(road, speed[k], rate, largest, rest)
             charged[:] = 0.0
             for c in range(channels.first.size):
                 if channels.group[c] != g:
@@ -219,7 +214,7 @@ def _pace(
                 first, last = channels.first[c], channels.first[c] + channels.span[c]
                 price = 0.0
                 for s in range(first, last):
-                    price += max(offered[g] - paid[s], least[g]) / rest[s]
+                    price += max(budget - paid[s], LEAST_SHARE * budget) / rest[s]
                 price *= 1.0 / channels.span[c]
                 prices[k, c] = price
                 if observed[k, c]:
@@ -274,13 +269,15 @@ def _moved(length: float, speed: float) -> float:
 
 
 @kernel_part
-def _remaining(road: Road, speed: FloatArray, rate: FloatArray, rest: FloatArray) -> None:
-    """Write the queried seconds that a vehicle on each cell has still to come."""
+def _remaining(
+    road: Road, speed: FloatArray, rate: FloatArray, largest: float, rest: FloatArray
+) -> None:
+    """Write the queried seconds to come on each cell, and the largest payment over its price."""
     n, S = road.n_mainline, road.n_segments
     rest[:S] = 0.0
     for e in range(road.exits.size):
         s, cell = road.exits[e], road.exit_cells[e]
-        rest[s] = MARGIN
+        rest[s] = largest
         if cell < rest.size:
             rest[s] += _seconds(road.lengths[s], speed[s]) * rate[cell]
             rest[cell] = rest[s]

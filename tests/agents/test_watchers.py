@@ -21,7 +21,7 @@ from tests.helpers import SHORT
 
 N_MAINLINE = 6
 SEEDS = (2000, 2001)
-PACED = {"preset": "paced", "epsilon": 5.0, "pace": 1.0, "clip": 20.0}
+PACED = {"preset": "paced", "epsilon": 5.0, "clip": 20.0}
 CAPPED = {"preset": "capped", "epsilon": 5.0, "cap": 8}
 
 

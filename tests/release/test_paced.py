@@ -276,7 +276,7 @@ def test_the_account_bounds_every_ledger_and_never_decreases(data):
 
 def test_where_queries_overlap_the_account_adds_what_a_vehicle_pays_for_all_of_them():
     """A vehicle that deviates by the clip pays exactly what the account says, query by query."""
-    asked = PacedSettings(epsilon=5.0, pace=0.2)
+    asked = PacedSettings(epsilon=5.0)
     release = Worlds(stays(1, 0.0)).started(asked, spans=(1, 2), bandwidth=6)
     # Segment 1, and the pairs that begin on 0 and on 1; another covers other segments.
     n_columns = release.task.n_channels
@@ -290,7 +290,7 @@ def test_where_queries_overlap_the_account_adds_what_a_vehicle_pays_for_all_of_t
 
 @pytest.mark.parametrize(("unit", "adjacency"), [("trip", "replace"), ("event", "add_remove")])
 def test_the_report_says_what_is_guaranteed(unit, adjacency):
-    privacy = {"unit": unit, "adjacency": adjacency, "pace": 0.7, "clip": 25.0}
+    privacy = {"unit": unit, "adjacency": adjacency, "clip": 25.0}
     found = privacy_report(resolve("private-highway", {"privacy": privacy}))
     mu = mu_of(5.0, 0.05)
     assert ("whole trip" in found.protects) == (unit == "trip")
@@ -311,7 +311,6 @@ def test_the_report_says_what_is_guaranteed(unit, adjacency):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"pace": 0.0}, r"pace must be .* \[0\.05, 1\], got 0\.0$"),
         ({"clip": math.inf}, r"clip must be .* \[1, 200\], got inf$"),
         ({"ratio": 1.0001}, r"ratio must be at most 1 for .*, got 1\.0001$"),
         ({"unit": "horizon"}, r"unit must be one of trip, event, got 'horizon'$"),

@@ -14,7 +14,7 @@ from dptse_env.release.report import in_order
 OWN = {
     "printed": {"adjacency"},
     "capped": {"unit", "cap", "adjacency", "share"},
-    "paced": {"unit", "adjacency", "pace", "clip", "ratio"},
+    "paced": {"unit", "adjacency", "clip", "ratio"},
 }
 
 

@@ -141,7 +141,6 @@ PACED = [
     {"unit": "event", "adjacency": "add_remove"},
     {"boundary_inputs": "private"},
     {"clip": 5.0, "ratio": 0.1},
-    {"pace": 0.05},
     {"epsilon": 0.1},
 ]
 FEW = [
@@ -180,7 +179,7 @@ def test_no_target_exceeds_mu(kind, setting, record):
         assert len({int(step) for path in worlds.pair for step in path.step}) == 1
 
 
-@pytest.mark.parametrize("setting", [config(preset="corrected"), config(cap=2), paced(pace=0.05)])
+@pytest.mark.parametrize("setting", [config(preset="corrected"), config(cap=2), paced()])
 def test_the_vehicle_that_is_deleted_tells_most(setting, record):
     chosen = reached(setting, Planner(setting).choose(record, "deleted"))
     everyone = []
