@@ -6,7 +6,7 @@ one inside compiled code.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -151,13 +151,13 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
 
 @kernel_part
 def process_noise(
-    road: Road, filters: Filters, mean: FloatArray, variance: FloatArray, slopes: FloatArray
+    road: Road, filters: Any, mean: FloatArray, variance: FloatArray, slopes: FloatArray
 ) -> None:
     """Write the process noise of a step that leaves a mean `(n_x,)`, as `add_noise` takes it.
 
     Args:
         road: The road.
-        filters: The filters.
+        filters: `Filters`, or what has the same units and variances.
         mean: The mean.
         variance: `(n_x,)`, written.
         slopes: `(S,)`, written.

@@ -16,6 +16,7 @@ from dptse_env.estimators.base import Estimate, KernelEstimator, Measurement
 from dptse_env.estimators.ekf import (
     find_observed,
     initial_variance,
+    process_noise,
     process_variance,
 )
 from dptse_env.estimators.linalg import factor, padded, solve_many
@@ -33,7 +34,7 @@ from dptse_env.model.columns import (
 from dptse_env.model.parameters import LARGEST_W
 from dptse_env.road import Road
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from dptse_env.utils.kernels import Bundle, copy_vector, kernel, kernel_part
+from dptse_env.utils.kernels import Bundle, kernel, kernel_part
 
 
 class Ensembles(NamedTuple):
@@ -47,9 +48,9 @@ class Ensembles(NamedTuple):
     streams: NDArray[np.uint64]  # (n, 2, 4, STREAM_WIDTH) of process noise and of measurement noise
     innovations: FloatArray  # (n, M, 2)
     diverged: BoolArray  # (n,)
-    process_deviation: FloatArray  # (n_x,) of a step [veh/km, veh/h, 1]
-    # (2,) deviations at rho_m of vehicles with the others' w, and of psi beside that
-    vehicle_noise: FloatArray
+    units: FloatArray  # (n_x,) of normalised components [veh/km, veh/h, 1]
+    process_variance: FloatArray  # (n_x,) normalised, of a step; see `Filters`
+    vehicle_variance: FloatArray  # (2,) normalised
     initial_deviation: FloatArray  # (n_x,) of the members around a prior [veh/km, veh/h, 1]
     density_scale: float  # rho_m [veh/km]
     inflation: float  # factor on distances from the mean before an update
@@ -145,50 +146,18 @@ def predict(bundle: Bundle, episodes: IntArray, inputs: FloatArray) -> None:
     """Predict members one step ahead under inputs `(k, n_u)`, with noise, and project them."""
     road, arz, _, ensembles = bundle.parts
     size, width = ensembles.members.shape[1:]
-    scratch, deviation = make_batch_scratch(road, width), np.empty(size)
-    slopes = np.empty(road.n_segments)
+    scratch, n = make_batch_scratch(road, width), ensembles.n_members
+    mean, variance, slopes = np.empty(size), np.empty(size), np.empty(road.n_segments)
     for k in range(episodes.size):
         members = ensembles.members[episodes[k]]
-        _process_deviation(road, arz, ensembles, members, deviation, slopes)
+        for i in range(size):
+            mean[i] = mean_of(members[i], n)
+        process_noise(road, ensembles, mean, variance, slopes)
         advance_states(road, arz, members, inputs[k], scratch)
-        draws = draw(ensembles.streams[episodes[k], 0], size * ensembles.n_members)
-        _perturb(members, ensembles.n_members, deviation, slopes, draws)
+        draws = draw(ensembles.streams[episodes[k], 0], size * n)
+        deviation = ensembles.units * np.sqrt(variance)
+        _perturb(members, n, deviation, arz.free_flow_speed * slopes, draws)
         project_states(road, arz, members, ensembles.is_box)
-
-
-@kernel_part
-def _process_deviation(
-    road: Road,
-    arz: ARZ,
-    ensembles: Ensembles,
-    members: FloatArray,
-    deviation: FloatArray,
-    slopes: FloatArray,
-) -> None:
-    """Write the process noise of a step that leaves the members.
-
-    Args:
-        road: The road.
-        arz: The model.
-        ensembles: The ensembles.
-        members: `(n_x, width)`.
-        deviation: `(n_x,)`, written with the deviations of rho, and of psi beside its slope.
-        slopes: `(S,)`, written with those of psi's noise by rho's [km/h].
-    """
-    copy_vector(ensembles.process_deviation, deviation)
-    scale, n, noise = ensembles.density_scale, ensembles.n_members, ensembles.vehicle_noise
-    for s in range(road.n_segments):
-        i, j = 2 * s, 2 * s + 1
-        slopes[s] = 0.0
-        rho = mean_of(members[i], n)
-        if (noise[0] > 0.0 or noise[1] > 0.0) and rho > 0.0:  # as for the EKF, `process_noise`
-            w = min(mean_of(members[j], n) / rho, LARGEST_W * arz.free_flow_speed)
-            share = rho / scale
-            alone, brought = deviation[i] ** 2, (noise[0] * scale) ** 2 * share
-            deviation[i] = np.sqrt(alone + brought)
-            slopes[s] = w * brought / (alone + brought)
-            own = (noise[1] * scale * arz.free_flow_speed) ** 2 * share + w * slopes[s] * alone
-            deviation[j] = np.sqrt(deviation[j] ** 2 + own)
 
 
 @kernel
@@ -409,8 +378,9 @@ class EnKF(KernelEstimator):
             streams=np.empty((n_episodes, 2, 4, STREAM_WIDTH), dtype=np.uint64),
             innovations=self.innovations,
             diverged=self.diverged,
-            process_deviation=np.sqrt(process_variance(model, settings)) * model.state_scale,
-            vehicle_noise=np.array(settings.vehicle_noise),
+            units=model.state_scale,
+            process_variance=process_variance(model, settings),
+            vehicle_variance=np.square(settings.vehicle_noise),
             initial_deviation=np.sqrt(initial_variance(model, settings)) * model.state_scale,
             density_scale=model.density_scale,
             inflation=settings.enkf.inflation,
