@@ -358,7 +358,7 @@ class QueryProcess:
         if self.loops is not None:
             times = self.time[episodes]
             readings = self.loops.last(self.traffic_index[episodes], times)
-            reading_age = times % self.loops.interval
+            reading_age = times % self.loops.interval / self.loops.interval
         state = PublicState(
             estimate=estimate,
             released=self.released.take(episodes, 0),

@@ -164,11 +164,16 @@ class LoopReadings:
         self._said = traffic.derived(shape, self._said_of)
 
     def last(self, traffic: IntArray, times: IntArray) -> FloatArray:
-        """Return last readings (k, F, 2) at seconds of the record (k,), NaN before the first."""
+        """Return last readings at seconds of the record (k,), NaN before the first.
+
+        Returns:
+            Flows [veh/h] and mean speeds [km/h], shape (k, F, 2).
+        """
         interval = times // self.interval - 1
         n_stations, some = self._traffic.readings.shape[2], interval >= 0
         found = np.full((len(times), n_stations, 2), np.nan)
         found[some] = self._traffic.readings[traffic[some], interval[some]]
+        found[..., 0] *= HOUR / self.interval
         return found
 
     def said(self, read: FloatArray) -> Said:

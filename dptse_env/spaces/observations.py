@@ -22,7 +22,6 @@ from dptse_env.release import Task
 from dptse_env.traffic.loops import borders_of
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.registry import Registry, is_foreign, missing_methods, name_of_class
-from dptse_env.utils.units import HOUR
 from dptse_env.utils.validation import require
 
 AGE_CAP = 60
@@ -55,10 +54,9 @@ class PublicState(NamedTuple):
         spent_share: The release model's public account of what a vehicle on each mainline segment
             has been charged on average, over its budget, in [0, 1], shape (k, n_mainline). None
             where queries have no prices.
-        readings: What each of the F stations of loops reported last, the number of vehicles and
-            their mean speed [km/h], NaN where it is not known, shape (k, F, 2). None where there
-            are no loops.
-        reading_age: Seconds since the interval of these readings ended, shape (k,).
+        readings: What each of the F stations of loops reported last, the flow [veh/h] and the mean
+            speed [km/h], NaN where it is not known, shape (k, F, 2). None where there are no loops.
+        reading_age: Intervals since that of these readings ended, below 1, shape (k,).
     """
 
     estimate: Estimate
@@ -70,7 +68,7 @@ class PublicState(NamedTuple):
     prices: FloatArray | None = None
     spent_share: FloatArray | None = None
     readings: FloatArray | None = None
-    reading_age: IntArray | None = None
+    reading_age: FloatArray | None = None
 
 
 class ObservationBlock(Protocol):
@@ -174,10 +172,6 @@ def _loops(task: Task) -> int:
     return len(task.corridor.stations.positions)
 
 
-def _interval(task: Task) -> int:
-    return 1 if task.corridor.loops is None else task.corridor.loops.interval
-
-
 def _has_loops(task: Task, _: bool) -> bool:
     return task.corridor.loops is not None
 
@@ -226,13 +220,12 @@ SHIPPED_BLOCKS = (
           is_default=lambda task, _: task.has_prices),
     Block("spent_share", _mainline, 0, 1, "spent_share",
           is_default=lambda task, _: task.has_prices),
-    Block("loop_flow", _loops, NOT_REPORTED, 4, "readings",
-          lambda task: _flow_scale(task) * _interval(task) / HOUR,
+    Block("loop_flow", _loops, NOT_REPORTED, 4, "readings", _flow_scale,
           lambda task: (slice(None), slice(None), 0), transform=_known, is_default=_has_loops),
     Block("loop_speed", _loops, NOT_REPORTED, 4, "readings", _speed_scale,
           lambda task: (slice(None), slice(None), 1), transform=_known, is_default=_has_loops),
-    Block("loop_age", lambda _: 1, 0, 1, "reading_age", _interval,
-          lambda task: (slice(None), None), is_default=_has_loops),
+    Block("loop_age", lambda _: 1, 0, 1, "reading_age", part=lambda task: (slice(None), None),
+          is_default=_has_loops),
     Block("loop_position", _loops, 0, 1, "", constant=_places, is_default=_has_loops),
 )  # fmt: skip
 """The shipped blocks; the default observation has those that are in it, in this order."""

@@ -101,8 +101,8 @@ def test_loops_show_what_they_reported_last_and_where_they_stand():
     assert [*encoder.slices][len(plain.slices) :] == [
         "loop_flow", "loop_speed", "loop_age", "loop_position"
     ]  # fmt: skip
-    reported = [[10.0, 25.0], [0.0, np.nan], [np.nan, np.nan], [1e6, 1e6]]
-    shown = state()._replace(readings=np.array([reported] * 2), reading_age=np.array([0, 15]))
+    reported = [[1200.0, 25.0], [0.0, np.nan], [np.nan, np.nan], [1e6, 1e6]]
+    shown = state()._replace(readings=np.array([reported] * 2), reading_age=np.array([0.0, 0.5]))
     observation = encoder.encode(shown)
     assert encoder.space.contains(observation[0])
     for name, values in {
