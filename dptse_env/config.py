@@ -19,6 +19,8 @@ from dptse_env.estimators import (
     checked_settings,
 )
 from dptse_env.estimators.tuned import (
+    is_of_another_road,
+    is_tuned,
     read_settings,
     tuned_estimator,
     tuned_settings,
@@ -117,7 +119,8 @@ class EnvConfig:
             with recordings by default all training seeds that were recorded.
         truth_in_info: Whether ``info`` shows the true traffic.
         inherited: Keywords whose values were measured or tuned on another road than this one, or
-            with other ARZ parameters, and that nobody gave; as `resolve` finds them.
+            with other ARZ parameters, or are defaults that nobody tuned, and that nobody gave; as
+            `resolve` finds them.
         origins: Text in front of messages on keywords that a road file gave, by keyword.
     """
 
@@ -611,8 +614,8 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
 
     Warns:
         UserWarning: The corridor is another road, or the ARZ parameters are of one's own, and
-            values that were measured or tuned for others, or assumed, are used; or the road is too
-            short for the default bandwidth.
+            values that were measured or tuned for others, or assumed, are used; or no settings of
+            the estimator were tuned; or the road is too short for the default bandwidth.
     """
     require_name("preset", preset, PRESETS)
     base, values, origins = PRESETS[preset], {**overrides}, dict[str, str]()
@@ -633,9 +636,9 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
     if not inherited:
         return config
     warnings.warn(
-        f"{', '.join(inherited)}: values measured or tuned on {base.corridor.name}, or assumed, "
-        "are used on another road or with other parameters; `dptse fit` fits parameters to a road "
-        "file, `dptse fit --tune` tunes settings",
+        f"{', '.join(inherited)}: values measured or tuned on another road or with other "
+        "parameters, or assumed, or defaults that nobody tuned, are used; `dptse fit` fits "
+        "parameters to a road file, `dptse fit --tune` tunes settings",
         UserWarning,
         stacklevel=1,  # one place, so that Python tells it once, however environments are made
     )
@@ -653,7 +656,7 @@ def _is_tuned_for_another(settings: Any, estimator: Any) -> bool:
 def _inherited(
     config: EnvConfig, given: Mapping[str, Any], assumed: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Return the keywords whose values are of another road or parameter set, or assumed."""
+    """Return the keywords whose values are of another road or parameters, assumed, or untuned."""
     corridor, parameters = config.corridor, config.parameters
     is_other_road = corridor.geometry not in [each.corridor.geometry for each in PRESETS.values()]
     found = []
@@ -665,10 +668,21 @@ def _inherited(
         if "parameters" not in given:
             found.append("parameters")
     is_other = is_other_road or parameters != load_parameters(tuned_with(parameters))
-    if is_other and config.settings_name is not None and "estimator_settings" not in given:
+    if "estimator_settings" not in given and _is_untuned(config, is_other):
         found.append("estimator_settings")
     centre = config.release_model.centre(corridor, config.privacy)
     estimator: type[Estimator] = ESTIMATORS.find(config.estimator)
     spans = max(config.query_spans)
     found += estimator.inherits(corridor.road, centre is not None, spans, config.settings())
     return tuple(found)
+
+
+def _is_untuned(config: EnvConfig, is_other: bool) -> bool:
+    """Return whether settings in force are those of another road or parameter set, or defaults.
+
+    Nobody expects tuned ones where the estimator or the release model is one's own.
+    """
+    name = config.settings_name
+    if name is None:
+        return is_tuned(config.estimator) and config.privacy.preset in RELEASE_MODELS
+    return is_other or is_of_another_road(name, config.corridor.name)

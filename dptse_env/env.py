@@ -116,7 +116,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | ``centre_fallback`` | under ``paced``: 1 if no prediction was finite to centre flows on |
     | ``truth``           | true traffic, with ``truth_in_info=True`` only                    |
     | ``privacy``         | at the reset only: the guarantee and its account, see `privacy`   |
-    | ``inherited``       | at the reset only: keywords whose values belong to another road   |
+    | ``inherited``       | at the reset only: keywords whose values are not of this road     |
 
     Values marked "true traffic" serve training and evaluation, as the reward does. They are not
     covered by the guarantee, and no policy may act on them. The others are public. ``spent_mu`` and

@@ -381,7 +381,7 @@ class QueryProcess:
         """Return the part of ``info`` that is added at a reset, the same for all episodes.
 
         ``privacy`` is the privacy report, ``inherited`` the keywords whose values were measured or
-        tuned on another road.
+        tuned on another road, or are settings that nobody tuned.
         """
         return {"privacy": self.privacy(), "inherited": list(self.config.inherited)}
 

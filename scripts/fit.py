@@ -336,12 +336,15 @@ def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:
     played = {**road.keywords, **keywords, "corridor": str(choice.place.folder / PLAYED)}
     with quietly():
         config = make_config(road.env, played)
+    settings = (
+        f"nobody tuned the settings of {choice.estimator}"
+        if config.settings_name is None
+        else f"the settings {config.settings_name} were tuned on another road with "
+        f"{tuned_with(config.parameters)}"
+    )
     said = {
         "parameters": f"the parameters {config.parameters.name} were fitted to another road",
-        "estimator_settings": (
-            f"the settings {config.settings_name} were tuned on another road with "
-            f"{tuned_with(config.parameters)}: dptse fit --tune makes settings of your own"
-        ),
+        "estimator_settings": f"{settings}: dptse fit --tune makes settings of your own",
     }
     return [said.get(key, f"{key} is of another road") for key in config.inherited]
 

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import warnings
 
 import gymnasium as gym
 import pytest
@@ -17,11 +18,18 @@ from dptse_env.config import (
     parse_seeds,
     resolve,
 )
-from dptse_env.estimators import EstimatorSettings, HorizonSettings
+from dptse_env.estimators import ESTIMATORS, EstimatorSettings, HorizonSettings
 from dptse_env.estimators.tuned import available_settings, load_settings
+from dptse_env.model import available_parameters
 from dptse_env.parts import make_release, make_task, privacy_report, warn_where_void
 from dptse_env.release import MOST_QUERIES, RELEASE_MODELS, CappedSettings, PrivacySettings
-from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, DemandDistribution, IncidentDistribution
+from dptse_env.traffic import (
+    CORRIDORS,
+    PAPER_HIGHWAY,
+    SHORT_HIGHWAY,
+    DemandDistribution,
+    IncidentDistribution,
+)
 from tests.helpers import SHORT, MeanRelease, SumRelease
 
 
@@ -120,8 +128,37 @@ def test_tuned_settings_are_found_by_estimator_parameters_privacy_and_road():
     assert "ekf-w99-3lane-printed" in available_settings()
     long = resolve("long-highway", {})
     assert long.settings_name == "ekf-w99-3lane-paced-long-highway"
-    assert resolve("long-highway", {"estimator": "mhe"}).settings_name == "mhe-w99-3lane-paced"
+    with pytest.warns(UserWarning, match="tuned on another road"):
+        other = resolve("long-highway", {"estimator": "mhe"})
+    assert other.settings_name == "mhe-w99-3lane-paced"
     assert resolve("private-highway", {}).settings_name == "ekf-w99-3lane-paced"
+
+
+TUNED = {"ekf", "ukf", "enkf", "mhe", "random_walk", "blend"}
+
+
+def test_every_shipped_combination_has_tuned_settings_or_says_that_it_has_none():
+    for road, parameters, privacy, estimator in itertools.product(
+        CORRIDORS, available_parameters(), RELEASE_MODELS, ESTIMATORS
+    ):
+        keywords = {"parameters": parameters, "privacy": privacy, "estimator": estimator}
+        name = f"{estimator}-{parameters}-{privacy}"
+        ways = (f"{name}-{road}",) if road == "long-highway" else (name,)
+        is_tuned = estimator not in TUNED or any(way in available_settings() for way in ways)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            config = resolve("paper-highway", {"corridor": road, **keywords})
+        expected = () if is_tuned else ("estimator_settings",)
+        assert config.inherited == expected, (road, name)
+        assert len(told) == len(expected)
+
+
+@pytest.mark.filterwarnings("error")
+def test_settings_that_are_given_need_no_tuned_ones():
+    given = {"privacy": "printed", "estimator": "blend"}
+    assert resolve("paper-highway", {**given, "estimator_settings": {}}).inherited == ()
+    with pytest.raises(UserWarning, match=r"^estimator_settings: .*defaults that nobody tuned"):
+        resolve("paper-highway", given)
 
 
 def test_a_tuned_set_by_name_serves_any_estimator():

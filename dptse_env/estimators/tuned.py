@@ -54,6 +54,17 @@ def tuned_with(parameters: ARZParameters) -> str:
     return parameters.derived_from or DEFAULT_PARAMETERS
 
 
+def is_tuned(estimator: Any) -> bool:
+    """Return whether tuned settings ship for an estimator, be it with other parts than its own."""
+    return any(entry["estimator"] == estimator for entry in _table().values())
+
+
+def is_of_another_road(name: str, road: str) -> bool:
+    """Return whether settings are not those of a road for which some were tuned by its name."""
+    end = f"-{road}"
+    return not name.endswith(end) and any(each.endswith(end) for each in _table())
+
+
 def settings_name(estimator: str, parameters: str, privacy: str, variant: str = "") -> str:
     """Return the name of tuned settings."""
     return "-".join((estimator, parameters, privacy, *((variant,) if variant else ())))
