@@ -19,8 +19,10 @@ from dptse_env.estimators import (
     checked_settings,
 )
 from dptse_env.estimators.tuned import (
+    PUBLISHED,
     is_of_another_road,
     is_tuned,
+    published_settings,
     read_settings,
     tuned_estimator,
     tuned_settings,
@@ -91,7 +93,8 @@ class EnvConfig:
         backend: ``compiled``, or ``reference``, which EKF, UKF, EnKF and MHE have.
         parameters: ARZ parameters; a name stands for a shipped set.
         estimator_settings: Tuning of the estimator, or the name of a shipped set
-            (`dptse_env.estimators.tuned`), whichever estimator it was tuned for. None for the
+            (`dptse_env.estimators.tuned`), whichever estimator it was tuned for; ``published`` for
+            EKF, UKF, EnKF and MHE as the paper has them. None for the
             set ``<estimator>-<ARZ parameters>-<privacy preset>-<corridor>``, or that without the
             corridor's name, if one ships, else the estimator's defaults. Parameters of one's own
             take those of the shipped ones that they were derived from.
@@ -216,10 +219,8 @@ class EnvConfig:
     @property
     def settings_name(self) -> str | None:
         """Name of the shipped set of estimator settings in force; None if there is none."""
-        given = self.estimator_settings
-        if given is None:
-            return _tuned(self.estimator, self.parameters, self.privacy, self.corridor)
-        return given if isinstance(given, str) else None
+        given, parameters = self.estimator_settings, self.parameters
+        return _shipped(given, self.estimator, parameters, self.privacy, self.corridor)
 
     def settings(self) -> Any:
         """Return the estimator's settings in force, of its settings' type.
@@ -364,13 +365,21 @@ def _parameters(path: str, value: Any, _base: Any) -> ARZParameters:
         return read_parameters(value)
 
 
-def _tuned(
-    estimator: Any, parameters: ARZParameters, privacy: PrivacySettings, corridor: Corridor
+def _shipped(
+    value: Any,
+    estimator: Any,
+    parameters: ARZParameters,
+    privacy: PrivacySettings,
+    corridor: Corridor,
 ) -> str | None:
-    """Return the name of the shipped settings that hold where none are given, if any ship."""
-    # A road of one's own takes no variant that happens to have its name.
-    road = corridor.name if corridor.name in CORRIDORS else ""
-    return tuned_settings(estimator, parameters, privacy.preset, road)
+    """Return the name of the shipped settings that a value stands for, as None does, if any."""
+    if value is None:
+        # A road of one's own takes no variant that happens to have its name.
+        road = corridor.name if corridor.name in CORRIDORS else ""
+        return tuned_settings(estimator, parameters, privacy.preset, road)
+    if isinstance(value, str) and value == PUBLISHED:
+        return published_settings(estimator, parameters, privacy.preset)
+    return value if isinstance(value, str) else None
 
 
 def _settings(
@@ -380,14 +389,16 @@ def _settings(
 
     Fields left out keep what None stands for: those of the tuned set, or else the defaults.
     """
-    tuned = _tuned(estimator, parameters, privacy, corridor)
+    shipped = partial(
+        _shipped, estimator=estimator, parameters=parameters, privacy=privacy, corridor=corridor
+    )
     if isinstance(value, Mapping):
-        base = checked_settings(estimator, tuned)
+        base = checked_settings(estimator, shipped(None))
         value = from_mapping(ESTIMATORS.find(estimator).settings_type, value, path, base)
     elif isinstance(value, str) and value.endswith(".json"):
         with within(f"{path}: "):
             value = read_settings(value)
-    checked_settings(estimator, tuned if value is None else value)
+    checked_settings(estimator, shipped(value) or value)
     return value
 
 

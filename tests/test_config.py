@@ -14,11 +14,13 @@ from dptse_env.config import (
     TEST_SEEDS,
     TRAINING_SEEDS,
     VALIDATION_SEEDS,
+    EnvConfig,
     UnknownKeywordError,
     parse_seeds,
     resolve,
 )
 from dptse_env.estimators import ESTIMATORS, EstimatorSettings, HorizonSettings
+from dptse_env.estimators.settings import EnsembleSettings, SigmaPointSettings
 from dptse_env.estimators.tuned import available_settings, load_settings
 from dptse_env.model import available_parameters
 from dptse_env.parts import make_release, make_task, privacy_report, warn_where_void
@@ -159,6 +161,40 @@ def test_settings_that_are_given_need_no_tuned_ones():
     assert resolve("paper-highway", {**given, "estimator_settings": {}}).inherited == ()
     with pytest.raises(UserWarning, match=r"^estimator_settings: .*defaults that nobody tuned"):
         resolve("paper-highway", given)
+
+
+PAPER_FILTERS = {
+    "ekf": {},
+    "ukf": {"ukf": SigmaPointSettings(alpha=0.1, beta=2.0, kappa=-4.0)},
+    "enkf": {"enkf": EnsembleSettings(n_members=100, inflation=1.0, taper=None)},
+    "mhe": {},
+}
+
+
+def test_the_papers_filters_have_its_settings_by_one_name():
+    for parameters, privacy, (estimator, own) in itertools.product(
+        available_parameters(), RELEASE_MODELS, PAPER_FILTERS.items()
+    ):
+        keywords = {"parameters": parameters, "privacy": privacy, "estimator": estimator}
+        config = resolve("paper-highway", {**keywords, "estimator_settings": "published"})
+        settings = config.settings()
+        (q,), scale = {*settings.process_noise}, settings.noise_scale
+        assert settings == EstimatorSettings(
+            process_noise=(q, q), noise_scale=scale, bounds="box", mhe=settings.mhe, **own
+        )
+        if estimator == "mhe":
+            (arrival,) = {*settings.mhe.arrival_noise}
+            assert settings.mhe == HorizonSettings(horizon=10, arrival_noise=(arrival, arrival))
+        if privacy in ("printed", "corrected"):  # R = r I, over rho_m and v_f
+            stds = [each.noise_std for each in privacy_report(config).releases]
+            arz = config.parameters
+            density, speed = (std * each for std, each in zip(stds, scale, strict=True))
+            ratio = density / arz.jam_density / (speed / arz.free_flow_speed)
+            assert ratio == pytest.approx(1.0, rel=1e-3)
+    assert EnvConfig(config, estimator="ekf").settings_name.startswith("ekf-")
+    for keywords in ({"estimator": "blend"}, {"privacy": SUMS}):
+        with pytest.raises(ValueError, match=r"^estimator_settings .* ekf, enkf, mhe, ukf with a"):
+            resolve("paper-highway", {**keywords, "estimator_settings": "published"})
 
 
 def test_a_tuned_set_by_name_serves_any_estimator():

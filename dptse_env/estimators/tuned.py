@@ -1,9 +1,9 @@
 """Tuned settings of the estimators: those that ship, files of others, which an environment gets.
 
 ``tuned.json`` has a table by name: ``<estimator>-<ARZ parameters>-<privacy preset>``, and for those
-of a road or another variant that with its name at the end. ``dptse fit --tune`` writes a file with
-one such entry, which the keyword ``estimator_settings`` takes. What an entry leaves out has the
-value of `EstimatorSettings`.
+of a road that with its name at the end. Those of the paper's filters, as the paper has them, end in
+``published``. ``dptse fit --tune`` writes a file with one such entry, which the keyword
+``estimator_settings`` takes. What an entry leaves out has the value of `EstimatorSettings`.
 """
 
 import json
@@ -22,6 +22,9 @@ _KEYS = {"estimator": str, "settings": dict, "provenance": dict}
 DEFAULT_PARAMETERS = "w99-3lane"
 """ARZ parameters whose tuned settings hold for parameters that do not say what they come from:
 those fitted to simulated traffic, which predict it about as well as others that are fitted."""
+
+PUBLISHED = "published"
+"""What stands for the settings of the paper's filters, whatever parameters and release model."""
 
 
 def tuned_settings(
@@ -45,6 +48,29 @@ def tuned_settings(
         return None
     names = [settings_name(estimator, tuned_with(parameters), preset, v) for v in (variant, "")]
     return next((name for name in names if name in _table()), None)
+
+
+def published_settings(estimator: Any, parameters: ARZParameters, preset: Any) -> str:
+    """Return the name of the shipped settings of one of the paper's filters, as the paper has them.
+
+    Args:
+        estimator: Name of the estimator.
+        parameters: The ARZ parameters of its model; see `tuned_settings`.
+        preset: The privacy preset.
+
+    Raises:
+        ValueError: The paper has no such filter, or it was not tuned for this release model.
+    """
+    name = settings_name(str(estimator), tuned_with(parameters), str(preset), PUBLISHED)
+    if name not in _table():
+        filters = {
+            at["estimator"] for each, at in _table().items() if each.endswith(f"-{PUBLISHED}")
+        }
+        raise ValueError(
+            f"{PATH} may be {PUBLISHED!r} for {', '.join(sorted(filters))} with a release model of "
+            f"the package alone, got {shown(estimator)} with {shown(preset)}"
+        )
+    return name
 
 
 def tuned_with(parameters: ARZParameters) -> str:

@@ -75,7 +75,7 @@ def test_settings_survive_json():
 
 def test_shipped_sets_are_named_after_what_they_are_for():
     cells = itertools.product(ESTIMATORS, available_parameters(), RELEASE_MODELS)
-    names = {settings_name(*cell, v) for cell in cells for v in ("", "demand", *CORRIDORS)}
+    names = {settings_name(*cell, v) for cell in cells for v in ("", "published", *CORRIDORS)}
     assert "ekf-w99-3lane-printed" in available_settings()
     assert set(available_settings()) <= names
     for name in available_settings():
