@@ -25,6 +25,7 @@ import torch
 from agents.environments import make_config, parse_env, quietly
 from agents.executors import Executor, run_in_order, this_process
 from agents.files import PLAN, check_plan
+from agents.filters.highways import Kind as HighwayKind
 from agents.filters.highways import draw_highway
 from agents.filters.plan import FilterPlan, Round, played_by
 from agents.filters.scenarios import Kind, ScenarioRanges
@@ -171,9 +172,9 @@ def train(task: Task, records: Path | None, executor: Executor = this_process) -
 
 def record_all(args: Args, plans: Iterable[FilterPlan], executor: Executor) -> None:
     """Record the traffic of the environments and highways of plans that is missing."""
-    numbers: set[int] = set()
+    highways: set[tuple[HighwayKind, int]] = set()
     for plan in plans:
-        numbers.update(range(*plan.ranges.highways), range(*plan.validation_highways))
+        highways.update(plan.highways())
         trained = plan.ranges.envs, plan.traffic_seeds
         for envs, seeds in (trained, (plan.validation_envs, plan.validation_seeds)):
             for env in envs:
@@ -181,9 +182,10 @@ def record_all(args: Args, plans: Iterable[FilterPlan], executor: Executor) -> N
                     corridor = make_config(*parse_env(env)).corridor
                 args.library(corridor, seeds)
     work = partial(record_highway, records=args.records)
-    run_in_order(executor, work, sorted(numbers), desc="highways", unit="record")
+    run_in_order(executor, work, sorted(highways), desc="highways", unit="record")
 
 
-def record_highway(number: int, records: Path | None) -> None:
+def record_highway(highway: tuple[HighwayKind, int], records: Path | None) -> None:
     """Record a highway if it is missing."""
-    record(draw_highway(number), [0], records, workers=1)
+    kind, number = highway
+    record(draw_highway(number, kind).corridor, [0], records, workers=1)

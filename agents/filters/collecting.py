@@ -40,7 +40,7 @@ class Episodes:
 
     Attributes:
         corridor: The road.
-        is_section: Whether it is a section of a highway.
+        is_taught: Whether initial weights may teach what to say of it (`Scenario.is_taught`).
         channels: What is measured.
         cells: The features of the road.
         start: Density [veh/km] and speed [km/h] of the prior and their deviations, (k, S, 4).
@@ -53,7 +53,7 @@ class Episodes:
     """
 
     corridor: Corridor
-    is_section: bool
+    is_taught: bool
     channels: Channels
     cells: Cells
     start: AnyArray
@@ -111,7 +111,7 @@ def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
     observed, values, sigma, centre = measured
     return Episodes(
         corridor=process.config.corridor,
-        is_section=scenario.section is not None,
+        is_taught=scenario.is_taught,
         channels=process.model.channels,
         cells=make_cells(process.model),
         start=recorder.start,
@@ -174,7 +174,7 @@ def draw_batch(rng: np.random.Generator, collected: Sequence[Episodes], n: int) 
     for _ in range(n):
         drawn = collected[int(rng.integers(len(collected)))]
         parts.append(drawn.pick(rng.integers(len(drawn.start), size=1)))
-    return Batch(sorted(parts, key=lambda part: part.is_section))
+    return Batch(sorted(parts, key=lambda part: not part.is_taught))
 
 
 class Batch:
@@ -198,9 +198,9 @@ class Batch:
         self.truth = torch.from_numpy(np.concatenate(truth, axis=1)).float()
 
     @property
-    def ordinary(self) -> Batch | None:
-        """The episodes that are not on sections, which come first; None if there are none."""
-        parts = [part for part in self._parts if not part.is_section]
+    def taught(self) -> Batch | None:
+        """The episodes that a teacher knows, which come first; None if there are none."""
+        parts = [part for part in self._parts if part.is_taught]
         return Batch(parts) if parts else None
 
     def features(self, t: int, predicted: FloatArray, age: FloatArray) -> Tensor:
@@ -242,11 +242,11 @@ def _roads(parts: Sequence[Episodes]) -> Roads:
             np.tile(units, (k * S, 1)),
             np.tile(np.arange(S) < corridor.geometry.n_mainline, k),
             n_episodes + np.repeat(np.arange(k), S),
-            np.full(k, not part.is_section),
+            np.full(k, part.is_taught),
         ))  # fmt: skip
         first, n_episodes = first + k * S, n_episodes + k
     arrays = [np.concatenate(column) for column in zip(*columns, strict=True)]
-    unit, limit, edges, scales, mainline, episode, ordinary = map(torch.from_numpy, arrays)
+    unit, limit, edges, scales, mainline, episode, taught = map(torch.from_numpy, arrays)
     return Roads(
         unit=unit.float(),
         limit=limit.float(),
@@ -254,6 +254,6 @@ def _roads(parts: Sequence[Episodes]) -> Roads:
         scales=scales.float(),
         mainline=mainline.float(),
         episode=episode.long(),
-        ordinary=ordinary.float(),
+        taught=taught.float(),
         n_episodes=n_episodes,
     )

@@ -1,47 +1,73 @@
-"""Random highways of some three kilometres, and sections of them that queues enter from outside.
+"""Random highways of some three kilometres, of several kinds.
 
-On a road that SUMO simulates, vehicles enter and leave freely. On a section of a longer one, queues
-also come in through the downstream end or arrive from upstream, as on measured roads.
+They are drawn for training and for judging alike: the numbers of highways keep both apart.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
-from dptse_env.importers.folder import ROAD
-from dptse_env.importers.measured import measure
-from dptse_env.traffic import Conditions, Corridor, Geometry, Record, RecordLibrary, Scales
+from dptse_env.traffic import Conditions, Corridor, Geometry, Scales
 from dptse_env.traffic.demand import Demand, Drivers, Incident, VehicleClass
-from dptse_env.traffic.imported import Kind, save_records
-from dptse_env.traffic.roads import write_corridor
-from dptse_env.utils.arrays import FloatArray, IntArray
+from dptse_env.utils.units import HOUR
+
+Kind = Literal["queues", "lorries", "convoys", "compliance", "weaving", "autobahn"]
+"""Kind of a highway.
+
+- ``queues``: queues at bottlenecks, most of them at the downstream end.
+- ``lorries``: up to 40 % of lorries of 75 to 95 km/h in free traffic, on limits of 100 to 130 km/h
+  and none.
+- ``convoys``: few vehicles of 25 to 50 km/h, or a load for which a stretch of road moves slowly.
+- ``compliance``: drivers whose free speed is 0.7 to 1.15 of the limit.
+- ``weaving``: an on-ramp 500 m ahead of an off-ramp, on four or five lanes.
+- ``autobahn``: three lanes, half of them without a limit, with lorries.
+"""
 
 DURATION, WARM_UP = 1150, 100
 """Length of a highway's record, and of its beginning in which the road fills [s]."""
-LANES, LENGTHS, LIMITS = (1, 6), (0.05, 0.25), (60.0, 130.0)
+LANES, LENGTHS, LIMITS = (1, 6), (0.05, 0.25), (60.0, 200.0)
 """Ranges of lanes, lengths of segments [km] and speed limits [km/h]."""
-SEGMENTS = (5, 60)
-"""Range of the number of segments of a section."""
 KILOMETRES = (2.5, 4.0)
 """Range of the length of a highway [km]."""
 CAPACITY = 1950.0
 """Flow of a lane [veh/h] that demands are drawn as shares of."""
 HEADWAYS = {"W99": (0.7, 1.6), "IDM": (0.9, 1.9), "Krauss": (0.8, 1.6)}
 """Desired time headways of drivers by their model [s]."""
-CANDIDATES, FREE = 24, 0.3
-"""Windows among which those of a section are drawn, and the weight of one without queues."""
-SLOW, LASTING = 0.5, 0.15
-"""In a queue, speeds are below this share of the limit for at least this share of the time."""
+LORRIES, LORRY_SPEEDS = (0.0, 0.4), (75.0, 95.0)
+"""Ranges of the share of lorries, and of their largest speed [km/h]."""
+FREE_SPEEDS = (0.7, 1.15)
+"""Range of the speed that drivers want, over the limit."""
+UNLIMITED = (150.0, 180.0, 200.0)
+"""Limits that stand for none [km/h]."""
 
 
-def draw_highway(number: int) -> Corridor:
-    """Return the highway of a number, always the same one.
+@dataclass(frozen=True)
+class Highway:
+    """A highway as it is simulated, and the limit that is published of it.
+
+    Attributes:
+        corridor: The simulated one; its limit is the mean speed that drivers want.
+        limit: The published limit [km/h].
+    """
+
+    corridor: Corridor
+    limit: float
+
+
+def draw_highway(number: int, kind: Kind = "queues") -> Highway:
+    """Return the highway of a number, always the same one."""
+    if kind == "queues":
+        corridor = _draw_queues(number)
+        return Highway(corridor, corridor.geometry.largest_speed_limit)
+    return _draw_free(np.random.default_rng([79, KINDS.index(kind), number]), number, kind)
+
+
+def _draw_queues(number: int) -> Corridor:
+    """Draw a highway with queues.
 
     Bottlenecks are temporary limits, most of them at the downstream end; more than half of them
     alternate every 20 to 90 s and send waves upstream. In one of seven there is little traffic.
@@ -117,6 +143,16 @@ def _draw_demand(rng: np.random.Generator, capacity: float, n_on_ramps: int) -> 
     )
 
 
+def _draw_rates(
+    rng: np.random.Generator, mean: float, n_on_ramps: int, at_ramps: tuple[float, float]
+) -> Demand:
+    """Return a demand that changes once or not at all."""
+    times = (0.0, float(rng.integers(300, DURATION - 200)))
+    mainline = tuple((time, round(float(mean * rng.uniform(0.75, 1.25)))) for time in times)
+    entering = tuple(round(float(rng.uniform(*at_ramps)), 0) for _ in range(n_on_ramps))
+    return Demand(mainline, entering)
+
+
 def _draw_bottlenecks(rng: np.random.Generator, n: int) -> tuple[Incident, ...]:
     found = []
     for k in range(int(rng.choice([0, 1, 2, 3], p=[0.07, 0.4, 0.35, 0.18]))):
@@ -134,152 +170,93 @@ def _draw_bottlenecks(rng: np.random.Generator, n: int) -> tuple[Incident, ...]:
     return tuple(found)
 
 
-@dataclass(frozen=True)
-class Section:
-    """A section of a highway, with several windows of time.
-
-    Attributes:
-        highway: Number of the highway (`draw_highway`).
-        segments: Number of its segments, at least two fewer than the highway has.
-        windows: Number of windows; each is the record of a traffic seed, from 0 on.
-        seconds: Length of a window [s].
-        averaged: Seconds over which densities and speeds are averaged, as detectors do. The record
-            is then a field without vehicles; 0 for the vehicles of every second.
-        sensors: Segments of the mainline that are measured every second.
-        seed: Seed of place and times.
-    """
-
-    highway: int
-    segments: int
-    windows: int
-    seconds: int
-    averaged: int = 0
-    sensors: tuple[int, ...] = ()
-    seed: int = 0
-
-    def write(self, folder: Path, library: RecordLibrary) -> Path:
-        """Write its road file and records to a folder, and return the path of the file.
-
-        Demand, exit shares and dwell are those of the windows.
-
-        Args:
-            folder: An empty folder.
-            library: Has the record of the highway, or makes it.
-
-        Raises:
-            OSError: The folder cannot be written.
-            RecordingError: The highway cannot be recorded.
-        """
-        highway = draw_highway(self.highway)
-        record = library.get(highway, 0)
-        first, starts = self._place(highway, record)
-        bare, columns = _section(highway, first, self)
-        cuts = [_cut(record, columns, start, self.seconds) for start in starts]
-        road = measure(bare, lambda: cuts)
-        kind: Kind = "fields" if self.averaged else "vehicles"
-        if self.averaged:
-            cuts = [_averaged(road, each, self.averaged) for each in cuts]
-        sources = [{"seed": seed, "start": start} for seed, start in enumerate(starts)]
-        kept = save_records(folder, road, cuts, sources, kind)
-        write_corridor(folder / ROAD, road.replaced(recordings=kept))
-        return folder / ROAD
-
-    def _place(self, highway: Corridor, record: Record) -> tuple[int, list[int]]:
-        """Return a first segment and the starts of windows, drawn preferably with queues."""
-        rng = np.random.default_rng([78, self.highway, self.segments, self.seed])
-        n = highway.geometry.n_mainline
-        lengths, limits = highway.road.lengths, highway.road.limits
-        density, speed = np.moveaxis(record.traffic(lengths, limits)[:, :n], -1, 0)
-        is_slow, is_empty = speed < SLOW * limits[:n], density.sum(axis=1) == 0.0
-
-        def draw(firsts: IntArray) -> tuple[IntArray, FloatArray]:
-            starts = rng.integers(WARM_UP, DURATION - self.seconds, size=CANDIDATES)
-            chances = np.empty(CANDIDATES)
-            for k, (first, start) in enumerate(zip(firsts, starts, strict=True)):
-                time = slice(start, start + self.seconds)
-                queues = is_slow[time, first : first + self.segments].mean(axis=0) > LASTING
-                chances[k] = 1.0 if queues.any() else FREE
-                if is_empty[time].all():
-                    chances[k] = 1e-9
-            return starts, chances / chances.sum()
-
-        firsts = rng.integers(1, n - self.segments, size=CANDIDATES)
-        first = int(rng.choice(firsts, p=draw(firsts)[1]))
-        starts, chances = draw(np.full(CANDIDATES, first))
-        return first, rng.choice(starts, self.windows, replace=False, p=chances).tolist()
+KINDS: tuple[Kind, ...] = (
+    "queues", "lorries", "convoys", "compliance", "weaving", "autobahn",
+)  # fmt: skip
+"""All kinds; those after the first one are mostly free traffic."""
 
 
-def _section(highway: Corridor, first: int, section: Section) -> tuple[Corridor, IntArray]:
-    """Return a section as a road, and the columns of its cells in the highway's record."""
-    n, lanes = section.segments, highway.geometry.segment_lanes[first : first + section.segments]
-    mainline = range(first, first + n)
-
-    def inside(faces: tuple[int, ...]) -> list[int]:
-        return [k for k, face in enumerate(faces) if first < face < first + n]
-
-    on, off = inside(highway.geometry.on_ramps), inside(highway.geometry.off_ramps)
-    before = highway.geometry.n_segments + 2  # then the boundary segments of ramps, on-ramps first
-    columns = [
-        *mainline,
-        *(highway.geometry.on_ramp_segments[k][0] for k in on),
-        *(highway.geometry.off_ramp_segments[k][0] for k in off),
-        first - 1,
-        first + n,
-        *(before + k for k in on),
-        *(before + len(highway.geometry.on_ramps) + k for k in off),
-    ]
-    geometry = dataclasses.replace(
-        highway.geometry,
+def _draw_free(rng: np.random.Generator, number: int, kind: Kind) -> Highway:
+    """Draw a highway of another kind than ``queues``."""
+    length = round(float(np.exp(rng.uniform(np.log(0.08), np.log(LENGTHS[1])))), 3)
+    n = max(round(float(rng.uniform(*KILOMETRES)) / length), 13)
+    free, limit = _draw_limit(rng, kind)
+    faces = _draw_ramps(rng, n) if rng.random() < 0.5 else []
+    lanes: Any = int(rng.choice([2, 3], p=[0.7, 0.3]))
+    exits, at_ramps = (0.03, 0.2), (150.0, 700.0)
+    busy = {"weaving": (0.4, 0.8), "autobahn": (0.2, 0.95)}.get(kind, (0.1, 0.75))
+    if kind == "autobahn":
+        lanes = 3
+    elif kind == "weaving":
+        first, lanes = int(rng.integers(n // 4, n // 2)), int(rng.integers(4, 6))
+        faces, exits, at_ramps = [(first, True)], (0.12, 0.3), (500.0, 1400.0)
+        faces.append((first + max(round(0.5 / length), 1), False))
+        if rng.random() < 0.5:  # with a lane of its own, which makes five
+            aside = range(faces[0][0], faces[1][0])
+            lanes = tuple(5 if k in aside else 4 for k in range(n))
+    most = max(lanes) if isinstance(lanes, tuple) else lanes
+    on, off = (tuple(face for face, enters in faces if enters is way) for way in (True, False))
+    demand = _draw_rates(rng, CAPACITY * most * rng.uniform(*busy), len(on), at_ramps)
+    incident = _draw_bottlenecks(rng, n) if rng.random() < 0.2 else ()
+    classes = _draw_lorries(rng, 0.3 if kind in ("compliance", "weaving") else LORRIES[1])
+    if kind == "convoys" and rng.random() < 0.5:
+        incident = _draw_load(rng, n, length)
+    elif kind == "convoys":
+        slow = round(float(rng.uniform(0.001, 0.006)), 4)
+        car = dataclasses.replace(classes[0], share=classes[0].share - slow)
+        speed = round(float(rng.uniform(25.0, 50.0)), 1)
+        classes = (car, *classes[1:], VehicleClass("convoy", slow, 12.0, largest_speed=speed))
+    model = str(rng.choice(["W99", "IDM", "Krauss"], p=[0.4, 0.35, 0.25]))
+    geometry = Geometry(
         n_mainline=n,
-        on_ramps=tuple(highway.geometry.on_ramps[k] - first for k in on),
-        off_ramps=tuple(highway.geometry.off_ramps[k] - first for k in off),
-        exit_shares=tuple(highway.geometry.exit_shares[k] for k in off),
+        on_ramps=on,
+        off_ramps=off,
+        exit_shares=tuple(round(float(rng.uniform(*exits)), 3) for _ in off),
         lanes=lanes,
+        segment_length=length,
+        speed_limit=free,
     )
-    demand = Demand(mainline=((0.0, 0.0),), on_ramps=(0.0,) * len(on))
-    road = Corridor(
-        name=f"{highway.name}-{first}",
-        geometry=geometry,
-        conditions=Conditions(demand, section.seconds),
-        scales=Scales.of(geometry, average_dwell=8.0),
-        fixed_sensors=section.sensors,
+    drivers = Drivers(
+        model=model,  # type: ignore[arg-type]
+        headway=round(float(rng.uniform(*HEADWAYS[model])), 2),
+        speed_deviation=round(float(rng.uniform(0.04, 0.18)), 3),
     )
-    return road, np.array(columns)
+    conditions = Conditions(demand, DURATION, incident, drivers, classes)
+    scales = Scales.of(geometry, average_dwell=8.0)
+    return Highway(Corridor(f"{kind}-{number}", geometry, conditions, scales), limit)
 
 
-def _cut(record: Record, columns: IntArray, start: int, seconds: int) -> Record:
-    """Return the record of some columns, from a second on."""
-    own = np.full(record.n_columns, -1)
-    own[columns] = np.arange(len(columns))
-    rows = slice(record.offsets[start], record.offsets[start + seconds + 1])
-    segment = own[record.segment[rows]]
-    keep = segment >= 0
-    step = record.step[rows][keep]
-    order = np.lexsort((segment[keep], step))
-    vehicle = np.unique(record.vehicle[rows][keep], return_inverse=True)[1]
-    return Record(
-        n_steps=seconds + 1,
-        n_columns=len(columns),
-        step=(step - start)[order],
-        vehicle=vehicle[order].astype(np.int32),
-        segment=segment[keep][order],
-        speed=record.speed[rows][keep][order],
+def _draw_limit(rng: np.random.Generator, kind: Kind) -> tuple[float, float]:
+    """Return the mean speed that drivers want, and the published limit [km/h]."""
+    low = {"lorries": 100.0, "autobahn": 120.0}.get(kind, 80.0)
+    limit = float(rng.choice(np.arange(low, 131.0, 10.0)))
+    if kind in ("lorries", "autobahn") and rng.random() < 0.4:
+        return round(float(rng.uniform(120.0, 145.0)), 1), float(rng.choice(UNLIMITED))
+    share = (
+        rng.uniform(*FREE_SPEEDS)
+        if kind == "compliance"
+        else rng.choice([1.0, rng.uniform(0.85, 1.1)])
     )
+    return round(float(limit * share), 1), limit
 
 
-def _averaged(road: Corridor, record: Record, seconds: int) -> Record:
-    """Return running means of densities and speeds over some seconds, as a field."""
-    counts, speeds = (
-        uniform_filter1d(each.astype(float), seconds, axis=0, mode="nearest")
-        for each in (record.counts, record.speed_sums)
-    )
-    # Sums of a running window leave rests of some 1e-13 where it is empty again.
-    least = 0.5 / seconds
-    lengths = road.road.lengths
-    density = np.where(counts < least, 0.0, counts) / lengths
-    speed = np.maximum(speeds, 0.0) / np.maximum(counts, least)
-    return Record(
-        n_steps=record.n_steps,
-        n_columns=record.n_columns,
-        field=np.stack([density, speed], axis=-1),
-    )
+def _draw_lorries(rng: np.random.Generator, most: float) -> tuple[VehicleClass, ...]:
+    """Return cars, and a share of lorries of one speed."""
+    share, speed = round(float(rng.uniform(LORRIES[0], most)), 3), rng.uniform(*LORRY_SPEEDS)
+    if share == 0.0:
+        return (VehicleClass("car", 1.0),)
+    lorry = VehicleClass("lorry", share, 12.0, largest_speed=round(float(speed), 1))
+    return VehicleClass("car", 1.0 - share), lorry
+
+
+def _draw_load(rng: np.random.Generator, n: int, length: float) -> tuple[Incident, ...]:
+    """Return limits that move along the road with a load, over some 300 m of it."""
+    speed, start = float(rng.uniform(20.0, 50.0)), float(rng.uniform(100.0, 500.0))
+    crossing, behind = HOUR * length / speed, HOUR * 0.3 / speed
+    limits: list[Incident] = []
+    for k in range(int(rng.integers(0, n // 2)), n):
+        time = start + crossing * len(limits)
+        if time + behind >= DURATION - 30:
+            break
+        limits.append(Incident(k, ((round(time, 1), round(time + behind, 1), round(speed, 1)),)))
+    return tuple(limits)

@@ -28,7 +28,7 @@ class Roads(NamedTuple):
     scales: Tensor  # (C, 2) of errors of densities [veh/km] and speeds [km/h]
     mainline: Tensor  # (C,) flags
     episode: Tensor  # (C,) index of the episode
-    ordinary: Tensor  # (k,) flags of the episodes that are not on sections of highways
+    taught: Tensor  # (k,) flags of the episodes that a teacher knows
     n_episodes: int
 
     def per_episode(self, values: Tensor) -> Tensor:

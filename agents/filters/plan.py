@@ -18,8 +18,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from agents.environments import PRIVATE, make_config, parse_env, quietly
-from agents.filters.highways import LANES, LENGTHS, LIMITS, SEGMENTS, Section, draw_highway
-from agents.filters.scenarios import MECHANISMS, Kind, Scenario, ScenarioRanges
+from agents.filters.highways import KINDS, LANES, LENGTHS, LIMITS, draw_highway
+from agents.filters.highways import Kind as HighwayKind
+from agents.filters.scenarios import MECHANISMS, Kind, Scenario, ScenarioRanges, numbers_of
+from agents.filters.sections import SEGMENTS, Section
 from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
@@ -90,8 +92,8 @@ class FilterPlan:
         validation_seeds: Traffic seeds to validate on.
         rounds: Rounds, one after the other.
         validation_envs: Environments to validate in, as ``ID`` or ``ID {JSON}``.
-        validation_highways: Numbers (first, stop) of the highways to validate on, with a section of
-            each.
+        validation_highways: Numbers (first, stop) of the highways to validate on, of all kinds
+            (`numbers_of`), with a section of each.
         ranges: Ranges that scenarios are drawn from.
         width: Width of the hidden state.
         windows: Windows of a section, or traffic seeds of another scenario.
@@ -184,12 +186,19 @@ class FilterPlan:
 
     def validation_sections(self) -> list[Section]:
         """Return the sections to validate on."""
-        numbers = range(*self.validation_highways)
-        longest = [draw_highway(number).geometry.n_mainline - 2 for number in numbers]
-        return [
-            Section(number, min(8 + 2 * (k % 6), most), 4, self.seconds)
-            for k, (number, most) in enumerate(zip(numbers, longest, strict=True))
-        ]
+        found = []
+        for kind in KINDS if self.ranges.free > 0.0 else KINDS[:1]:
+            for k, number in enumerate(numbers_of(kind, self.validation_highways)):
+                most = draw_highway(number, kind).corridor.geometry.n_mainline - 2
+                segments = min(8 + 2 * (k % 6), most)
+                found.append(Section(number, segments, 4, self.seconds, kind=kind))
+        return found
+
+    def highways(self) -> list[tuple[HighwayKind, int]]:
+        """Return the highways to train and to validate on, by kind and number."""
+        kinds = KINDS if self.ranges.free > 0.0 else KINDS[:1]
+        ranges = (self.ranges.highways, self.validation_highways)
+        return [(k, number) for k in kinds for each in ranges for number in numbers_of(k, each)]
 
     def validation_cells(
         self, roads: Sequence[Path] = (), estimator: Mapping[str, Any] = MappingProxyType({})

@@ -13,7 +13,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from agents.environments import PRIVATE, make_config, parse_env
-from agents.filters.highways import SEGMENTS, Section, draw_highway
+from agents.filters.highways import KINDS, draw_highway
+from agents.filters.highways import Kind as HighwayKind
+from agents.filters.sections import SEGMENTS, Section
 from agents.play import Cell
 from dptse_env.utils.validation import Interval, checked_fields, require
 
@@ -35,6 +37,8 @@ BOUNDARIES: dict[Kind, dict[str, float]] = {
 """Sources of the boundary inputs, and how likely each is where it is not the usual one."""
 EPSILONS, CAPS = (0.5, 20.0), (24, 128)
 """Ranges of epsilon, and of the cap of ``capped``; drawn log-uniformly."""
+LITTLE_NOISE, HARDLY_ANY, NONE = 0.25, 1000.0, 1e4
+"""Share of scenarios whose epsilon is larger, up to this one, or in one of five none at all."""
 DELTAS = (0.05, 0.001)
 """Values of delta."""
 CLIPS = (18.0, 51.0)
@@ -102,6 +106,11 @@ class Scenario(Cell):
     seeds: tuple[int, ...] = ()
     section: Section | None = None
 
+    @property
+    def is_taught(self) -> bool:
+        """Whether initial weights may know such roads and noise, and so may teach."""
+        return self.section is None and self.keywords["privacy"]["epsilon"] <= EPSILONS[1]
+
 
 @dataclass(frozen=True)
 class ScenarioRanges:
@@ -110,7 +119,8 @@ class ScenarioRanges:
     Attributes:
         envs: Environments, each an id or an id, a space and keywords as JSON (`parse_env`).
         sections: Share of the scenarios that are on sections of highways, not in one of `envs`.
-        highways: Numbers (first, stop) of these highways.
+        highways: Numbers (first, stop) of these highways; see `numbers_of`.
+        free: Share of the sections that are on highways of other kinds than ``queues``.
         schedules: Query schedules.
         spans: Spans of queries under ``paced``.
 
@@ -121,6 +131,7 @@ class ScenarioRanges:
     envs: tuple[str, ...] = ROADS
     sections: Annotated[float, Interval(0, 1)] = 0.5
     highways: tuple[int, int] = (0, 80)
+    free: Annotated[float, Interval(0, 1)] = 0.5
     schedules: tuple[str, ...] = SCHEDULES
     spans: tuple[tuple[int, ...], ...] = ((1,), (2,), (1, 2))
 
@@ -190,11 +201,14 @@ class ScenarioRanges:
     def _draw_section(
         self, rng: np.random.Generator, windows: int, seconds: int, averaged: bool
     ) -> Section:
-        number = int(rng.integers(*self.highways))
-        most = min(draw_highway(number).geometry.n_mainline - 2, SEGMENTS[1])
+        kind: HighwayKind = "queues"
+        if rng.random() < self.free:
+            kind = KINDS[int(rng.integers(1, len(KINDS)))]
+        number = int(rng.choice(numbers_of(kind, self.highways)))
+        most = min(draw_highway(number, kind).corridor.geometry.n_mainline - 2, SEGMENTS[1])
         fewest = SEGMENTS[0]
         segments = int(np.exp(rng.uniform(np.log(fewest), np.log(min(20, most) + 1.0))))
-        if rng.random() < 0.1:
+        if rng.random() < (0.1 if kind == "queues" else 0.4):
             segments = most
         n_sensors = int(rng.choice([0, 1, 2, 3], p=[0.6, 0.2, 0.1, 0.1]))
         sensors = rng.choice(segments, size=n_sensors, replace=False)
@@ -206,13 +220,24 @@ class ScenarioRanges:
             averaged=int(rng.integers(3, 11)) if averaged else 0,
             sensors=tuple(int(each) for each in sensors),
             seed=int(rng.integers(2**31)),
+            kind=kind,
         )
 
 
+def numbers_of(kind: HighwayKind, highways: tuple[int, int]) -> range:
+    """Return the numbers of the highways of a kind: of others than ``queues`` the first fifth."""
+    first, stop = highways
+    return range(first, stop if kind == "queues" else first + -(-(stop - first) // 5))
+
+
 def _draw_privacy(rng: np.random.Generator, mechanism: str) -> dict[str, Any]:
+    range_of = (EPSILONS[1], HARDLY_ANY) if rng.random() < LITTLE_NOISE else EPSILONS
+    epsilon = round(float(np.exp(rng.uniform(*np.log(range_of)))), 3)
+    if range_of != EPSILONS and rng.random() < 0.2:
+        epsilon = NONE
     privacy: dict[str, Any] = {
         "preset": mechanism,
-        "epsilon": round(float(np.exp(rng.uniform(*np.log(EPSILONS)))), 3),
+        "epsilon": epsilon,
         "delta": float(rng.choice(DELTAS)),
     }
     if mechanism == "capped":

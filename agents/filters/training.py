@@ -144,7 +144,7 @@ class FilterTraining(TrainingFolder):
             group["lr"] = rate
         rng = np.random.default_rng([plan.seed, 2**31, self.done])
         batch = draw_batch(rng, collected, plan.episodes)
-        taught = batch.ordinary if self._teacher is not None else None
+        taught = batch.taught if self._teacher is not None else None
         states = [_begin(each, plan.width) for each in (batch, taught) if each is not None]
         losses, errors = [], []
         for first in range(0, plan.seconds, WINDOW):
@@ -180,7 +180,7 @@ class FilterTraining(TrainingFolder):
         plan, network, roads = self.plan, self.network, batch.roads
         states[0], present, ahead = _advance(network, batch, window, states[0])
         truth, after = (batch.truth[window.start + k : window.stop + k] for k in (0, 1))
-        weight = 1.0 - plan.teacher * roads.ordinary if taught is not None else None
+        weight = 1.0 - plan.teacher * roads.taught if taught is not None else None
         loss = second_loss(roads, present, truth, LIKELIHOOD, weight)
         error = float(second_loss(roads, present.detach(), truth, 0.0))
         if len(after) > 0:
@@ -189,7 +189,7 @@ class FilterTraining(TrainingFolder):
         if taught is not None and self._teacher is not None:
             with torch.no_grad():
                 states[1], *said = _advance(self._teacher, taught, window, states[1])
-            n = len(taught.start)  # ordinary scenarios come first
+            n = len(taught.start)  # they come first
             for own, of_teacher, factor in zip(
                 (present, ahead), said, (1.0, PREDICTION), strict=True
             ):
@@ -222,7 +222,7 @@ class FilterTraining(TrainingFolder):
         """Return the road files of the sections to validate on; write those that are missing."""
         library, roads = open_library(self._records), list[Path]()
         for section in self.plan.validation_sections():
-            folder = self.folder / SECTIONS / str(section.highway)
+            folder = self.folder / SECTIONS / f"{section.kind}-{section.highway}"
             if not folder.exists():
                 with new_folder(folder) as made:
                     section.write(made, library)

@@ -131,7 +131,7 @@ def fit_parameters(
         kept: JSON file of what was tried.
     """
     limit = corridor.geometry.largest_speed_limit
-    low = np.log([0.8 * limit, max(densest, 40.0), 0.1, 5.0])
+    low = np.log([0.4 * limit, max(densest, 40.0), 0.1, 5.0])
     high = np.log([2.5 * limit, max(2.0 * densest, 300.0), 5.0, 500.0])
     tried: dict[tuple[float, ...], float] = {}
     if kept.exists():

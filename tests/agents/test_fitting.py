@@ -251,8 +251,8 @@ def test_the_search_finds_the_least_error_and_says_where_it_ended_at_a_bound(tmp
     assert inside.parameters.gamma == pytest.approx(0.8, rel=0.05)
     assert inside.error < 50.5 < inside.start
     assert not any(each.startswith(("free_flow_speed", "gamma")) for each in inside.at_bounds)
-    outside = fit(lambda p: bowl(p, v_f=20.0), "outside.json")
-    assert any("free_flow_speed ended at 72, the least" in each for each in outside.at_bounds)
+    outside = fit(lambda p: bowl(p, v_f=10.0), "outside.json")
+    assert any("free_flow_speed ended at 36, the least" in each for each in outside.at_bounds)
 
 
 def test_a_start_is_slowed_down_until_the_time_step_suits_short_segments(tmp_path):

@@ -1,7 +1,8 @@
-"""Estimators on roads that nobody trained on: own roads, and sections of longer ones.
+"""Estimators on roads that nobody trained on: own roads, drawn ones, and sections of longer ones.
 
-Every vehicle answers queries, which go round robin. The filters have the parameters and settings
-that were calibrated for PrivateHighway-v1. Weights other than those of the package are given with
+Every vehicle answers queries, which go round robin. The filters have the settings that were tuned
+for PrivateHighway-v1, and its parameters; on drawn roads parameters that were calibrated on each.
+Weights other than those of the package are given with
 the name of the study; rows of the others are played once.
 
 dptse study 'roads {"weights": ["results/weights/seed-2/roads"]}' --output results/mine
@@ -12,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -26,7 +27,8 @@ from agents.environments import LONG, PAPER, PRIVATE
 from agents.figures import LABELS, draw_errors, save_measured
 from agents.play import Cell
 from agents.statistics import Interval
-from agents.studies.roads.recorded import QUEUES
+from agents.studies.roads import drawn
+from agents.studies.roads.recorded import QUEUES, TEST
 from agents.study import Study
 from agents.tables import (
     DENSITY,
@@ -48,11 +50,16 @@ from dptse_env.utils.validation import convert
 
 SEEDS, MORE_SEEDS = tuple(range(2000, 2008)), tuple(range(2000, 2016))
 FILTERS, RECURRENT, MIXTURE = ("ekf", "blend", "asm"), "recurrent", "mixture"
+ALL_FILTERS = ("ekf", "ukf", "enkf", "mhe", "blend", "asm")
+"""Filters on drawn roads."""
 PACED, CORRECTED = "paced", "corrected"
+MUCH_NOISE, LITTLE_NOISE = "paced, ε = 1", "paced, ε = 1000"
 RELEASES: dict[str, dict[str, Any]] = {
     PACED: {"privacy": PACED, "epsilon": 5.0},
     CORRECTED: {"privacy": CORRECTED, "epsilon": 1.0},
     "printed": {"privacy": "printed", "epsilon": 1.0},
+    MUCH_NOISE: {"privacy": PACED, "epsilon": 1.0},
+    LITTLE_NOISE: {"privacy": PACED, "epsilon": 1000.0},
 }
 """Keywords of the release models, which are those of the environments that come with them."""
 
@@ -81,11 +88,13 @@ class Road(NamedTuple):
         env: Environment id.
         parts: Keywords, each with traffic seeds that no other one has.
         releases: Release models.
+        filters: Filters that the network is held against.
     """
 
     env: str
     parts: Sequence[_Part]
     releases: Sequence[str] = (PACED, CORRECTED)
+    filters: Sequence[str] = FILTERS
 
 
 def _section(number: int) -> _Part:
@@ -118,12 +127,18 @@ OTHERS: dict[str, Road] = {
 }
 """Beside the own roads: recorded ones, and those that weights are trained on."""
 OWN = {name: Road(PRIVATE, [(keywords, SEEDS)]) for name, keywords in _OWN_ROADS.items()}
-ROADS = {**OWN, **OTHERS}
+DRAWN = {
+    name: Road(
+        PRIVATE, [(drawn.keywords(name), TEST)], (MUCH_NOISE, PACED, LITTLE_NOISE), ALL_FILTERS
+    )
+    for name in drawn.NAMES
+}
+ROADS = {**OWN, **OTHERS, **DRAWN}
 
 
-def lines() -> list[tuple[str, str]]:
+def lines(roads: Iterable[str] = (*OWN, *OTHERS)) -> list[tuple[str, str]]:
     """Return each road with each of its release models."""
-    return [(name, release) for name, road in ROADS.items() for release in road.releases]
+    return [(name, release) for name in roads for release in ROADS[name].releases]
 
 
 def on_road(road: str, release: str, estimator: str, network: str = "") -> Labels:
@@ -133,7 +148,7 @@ def on_road(road: str, release: str, estimator: str, network: str = "") -> Label
 
 def member(weights: str, release: str) -> str | None:
     """Return the member of a pair that suits a release model; None where it is missing."""
-    found = member_for(weights, flows=release == PACED)
+    found = member_for(weights, flows=RELEASES[release]["privacy"] == PACED)
     return found if found in shipped_weights() or Path(found).is_file() else None
 
 
@@ -156,23 +171,25 @@ def named(weights: str) -> str:
     return f"{Path(weights).name} {digest[:6]}"
 
 
-def study(weights: Sequence[str] = ()) -> Study:
+def study(weights: Sequence[str] = (), drawn_roads: bool = True) -> Study:
     """Return the study, with some weights beside those of the package.
 
     Args:
         weights: Each a name or what the files of a pair begin with. One of a pair is played where
             it suits.
+        drawn_roads: Whether drawn roads are played, too.
 
     Raises:
         FileNotFoundError: There are no such weights.
         ValueError: They are no list of texts.
     """
     weights = convert(tuple[str, ...], weights, "weights")
-    who = [(name, "", "") for name in (*FILTERS, RECURRENT, MIXTURE)]
+    who = [(name, "", "") for name in (*ALL_FILTERS, RECURRENT, MIXTURE)]
     who += [(RECURRENT, named(each), each) for each in weights]
-    cells = []
-    for (name, release), (estimator, network, own) in product(lines(), who):
-        if own and not member(own, release):
+    cells, roads = [], ROADS if drawn_roads else (*OWN, *OTHERS)
+    for (name, release), (estimator, network, own) in product(lines(roads), who):
+        is_other = estimator in ALL_FILTERS and estimator not in ROADS[name].filters
+        if is_other or (own and not member(own, release)):
             continue
         more: dict[str, Any] = {**RELEASES[release], "estimator": estimator}
         if own:
@@ -202,7 +219,8 @@ def best_filter(rows: pl.DataFrame, road: str, release: str) -> str:
     Raises:
         UnmeasuredError: One of them was not played there.
     """
-    return min(FILTERS, key=lambda name: mean(rows, on_road(road, release, name), ERROR).mean)
+    filters = ROADS[road].filters
+    return min(filters, key=lambda name: mean(rows, on_road(road, release, name), ERROR).mean)
 
 
 def gain(rows: pl.DataFrame, learned: Learned, road: str, release: str) -> Interval:
@@ -221,9 +239,9 @@ def learned_in(rows: pl.DataFrame) -> list[Learned]:
     return [*SHIPPED, *(Learned(RECURRENT, name) for name in own["network"].unique().sort())]
 
 
-def table_of(rows: pl.DataFrame, learned: Learned) -> str:
-    """Return the table of an estimator with weights beside the filters."""
-    own = learned.estimator
+def table_of(rows: pl.DataFrame, learned: Learned, roads: Iterable[str] = (*OWN, *OTHERS)) -> str:
+    """Return the table of an estimator with weights beside the filters of some roads."""
+    own, filters = learned.estimator, ROADS[next(iter(roads))].filters
 
     def of(estimator: str, line: tuple[str, str]) -> Labels:
         return on_road(*line, estimator, learned.network if estimator == own else "")
@@ -239,13 +257,28 @@ def table_of(rows: pl.DataFrame, learned: Learned) -> str:
         return f"{errors[0] / errors[1]:.2f}"
 
     columns: dict[str, Callable[[tuple[str, str]], str]] = {
-        **{LABELS[name]: partial(error, name) for name in (*FILTERS, own)},
+        **{LABELS[name]: partial(error, name) for name in (*filters, own)},
         "below best filter [%]": lambda line: tenths(gain(rows, learned, *line)),
-        **{f"χ² of {LABELS[name]}": partial(honesty, name) for name in (FILTERS[-1], own)},
+        **{f"χ² of {LABELS[name]}": partial(honesty, name) for name in (filters[-1], own)},
         "density RMSE over EKF's": density_ratio,
     }
-    heads = {f"{line[0]}{'*' * (line[0] in KEPT_BACK)}, {line[1]}": line for line in lines()}
+    heads = {f"{line[0]}{'*' * (line[0] in KEPT_BACK)}, {line[1]}": line for line in lines(roads)}
     return table("", heads, columns)
+
+
+def losses(rows: pl.DataFrame, learned: Learned) -> str:
+    """Return the drawn roads where an estimator errs more than the best filter, in a sentence.
+
+    Raises:
+        UnmeasuredError: Something was not played.
+    """
+    gains = {
+        f"{road}, {release}": gain(rows, learned, road, release) for road, release in lines(DRAWN)
+    }
+    lost = [f"{head} ({tenths(each)} %)" for head, each in gains.items() if each.mean < 0.0]
+    total = np.mean([each.mean for each in gains.values()])
+    where = "; ".join(lost) or "none"
+    return f"{total:.1f} % below the best filter in the mean. It loses on: {where}."
 
 
 def summary(rows: pl.DataFrame, learned: Learned) -> str:
@@ -282,7 +315,7 @@ def draw_gains(rows: pl.DataFrame) -> Figure:
             for road in names
             if release in ROADS[road].releases
         }
-        for release in RELEASES
+        for release in dict.fromkeys(release for _, release in lines())
     }
     return draw_errors(names, series, log=False)
 
@@ -294,7 +327,10 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     parts = ["# Roads that nobody trained on", NOTES, "![Gains](fig_roads.png)"]
     for each in learned_in(rows):
         parts += [f"## {each}", cell(summary, rows, each), table_of(rows, each)]
+        if not rows.filter(pl.col("road").is_in(list(DRAWN))).is_empty():
+            parts += [f"### {each} on drawn roads", cell(losses, rows, each)]
+            parts.append(table_of(rows, each, DRAWN))
     return "\n\n".join(parts)
 
 
-STUDY = study()
+STUDY = study(drawn_roads=False)

@@ -1,6 +1,7 @@
 """Sections of highways, recorded in the user's cache when they are first used.
 
-A configuration names them by this module, as ``"agents.studies.roads.recorded:section_10003"``.
+A configuration names them by this module, as ``"agents.studies.roads.recorded:section_10003"`` or
+``"agents.studies.roads.recorded:lorries_10000"``.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from agents.filters import highways
-from agents.filters.highways import Section
+from agents.filters import sections
+from agents.filters.highways import KINDS, Highway, draw_highway
+from agents.filters.highways import Kind as HighwayKind
+from agents.filters.sections import Section
 from dptse_env.importers.folder import ROAD, new_folder
 from dptse_env.traffic import Corridor, RecordLibrary, read_corridor, write_corridor
 from dptse_env.traffic.imported import load_record, save_records
 from dptse_env.traffic.library import CACHE_VARIABLE, default_path
-from dptse_env.utils.files import file_digest, require_writable
+from dptse_env.utils.files import file_digest, json_digest, require_writable
 
 QUEUES: dict[str, tuple[int, ...]] = {
     "queue through the end": (
@@ -38,17 +41,37 @@ is no queue in less than 2 %. Weights are trained on highways of smaller numbers
 """
 
 
+TRAINING, TEST = (0, 1, 2), tuple(range(2000, 2012))
+"""Traffic seeds of drawn roads: those that parameters of filters are fitted to, and the study's."""
+SECONDS = 500
+"""Length of their episodes [s]."""
+
+
 def __getattr__(name: str) -> Callable[[], Corridor]:
-    """Return what makes the section ``section_<number>``."""
+    """Return what makes the road ``<kind>_<number>``; ``section`` is a section with queues."""
     kind, _, number = name.partition("_")
-    if kind != "section" or not number.isdecimal():
+    makers: dict[str, Callable[[int], Corridor]] = {"section": section}
+    makers |= {each: partial(drawn, each) for each in KINDS[1:]}
+    if kind not in makers or not number.isdecimal():
         raise AttributeError(f"{__name__} has no {name!r}")
-    return partial(section, int(number))
+    return partial(makers[kind], int(number))
 
 
 def section(number: int) -> Corridor:
     """Return a section of a highway, whose record has the highway's number as its traffic seed."""
-    name = f"section-{number}-{file_digest(highways.__file__)[:16]}"
+    return _kept(f"section-{number}", draw_highway(number), partial(_write_section, number))
+
+
+def drawn(kind: HighwayKind, number: int) -> Corridor:
+    """Return a highway of another kind, but for its ends, with records of all its seeds."""
+    write = partial(_write_drawn, kind, number)
+    return _kept(f"{kind}-{number}", draw_highway(number, kind), write)
+
+
+def _kept(name: str, highway: Highway, write: Callable[[Path], None]) -> Corridor:
+    """Return the road of a folder in the cache, which is written when it is first used."""
+    made_of = [highway.corridor.digest, highway.limit, file_digest(str(sections.__file__))]
+    name = f"{name}-{json_digest(made_of)[:16]}"
     folder = default_path() / "roads" / name
     if not folder.exists():
         require_writable(CACHE_VARIABLE, default_path())
@@ -56,7 +79,7 @@ def section(number: int) -> Corridor:
         with FileLock(folder.parent / f".{name}.lock"):
             if not folder.exists():
                 with new_folder(folder) as empty:
-                    _write_section(number, empty)
+                    write(empty)
     return read_corridor(folder / ROAD)
 
 
@@ -67,3 +90,10 @@ def _write_section(number: int, folder: Path) -> None:
         record = load_record(road, 0)
     kept = save_records(folder, road, [record], [{"seed": number}])
     write_corridor(folder / ROAD, road.replaced(recordings=kept))
+
+
+def _write_drawn(kind: HighwayKind, number: int, folder: Path) -> None:
+    segments, seeds = draw_highway(number, kind).corridor.geometry.n_mainline - 2, TRAINING + TEST
+    Section(number, segments, len(seeds), SECONDS, kind=kind, traffic=seeds).write(
+        folder, RecordLibrary()
+    )

@@ -4,9 +4,12 @@ from pathlib import Path
 import pytest
 
 from agents.environments import make_config, quietly
-from agents.filters.highways import SLOW
+from agents.filters.highways import KINDS
+from agents.filters.plan import FilterPlan
+from agents.filters.scenarios import ScenarioRanges
+from agents.filters.sections import SLOW
 from agents.studies import roads
-from agents.studies.roads import on_road, recorded
+from agents.studies.roads import drawn, on_road, recorded
 from agents.study import read_rows
 from agents.tables import pick
 from dptse_env.estimators import recurrent
@@ -37,6 +40,21 @@ def test_own_roads_are_others_and_their_filters_are_calibrated():
     assert len(roads.KEPT_BACK) == 4
 
 
+def test_drawn_roads_are_no_training_roads_and_have_all_filters():
+    for name in drawn.NAMES:
+        kind, _, number = name.partition("_")
+        trained = FilterPlan.validation_highways, ScenarioRanges.highways
+        assert not any(int(number) in range(*each) for each in trained)
+        assert kind in KINDS
+    played = {
+        cell.labels["estimator"]
+        for cell in roads.study().cells
+        if cell.labels["road"] in roads.DRAWN
+    }
+    assert played == {*roads.ALL_FILTERS, "recurrent", "mixture"}
+    assert {cell.id for cell in roads.STUDY.cells} < {cell.id for cell in roads.study().cells}
+
+
 def test_all_roads_are_played():
     assert {cell.labels["road"] for cell in roads.study().cells} == set(roads.ROADS)
 
@@ -55,7 +73,8 @@ def test_weights_in_files_have_cells_of_their_own_which_follow_the_content(tmp_p
     assert changed & first == known
     Path(f"{prefix}-speeds.safetensors").unlink()
     cells = roads.study([str(prefix)]).cells
-    assert {each.labels["release"] for each in cells if each.labels["network"]} == {"paced"}
+    releases = {each.labels["release"] for each in cells if each.labels["network"]}
+    assert releases == {"paced", roads.MUCH_NOISE, roads.LITTLE_NOISE}
     Path(f"{prefix}-flows.safetensors").unlink()
     with pytest.raises(FileNotFoundError, match=r"weights must be .*mine"):
         roads.study([str(prefix)])
