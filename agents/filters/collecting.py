@@ -24,7 +24,14 @@ from agents.filters.network import Roads
 from agents.filters.scenarios import Scenario
 from agents.play import record
 from dptse_env.estimators import Measurement
-from dptse_env.estimators.recurrent_kernels import N_FEATURES, Cells, Memory, make_cells, read
+from dptse_env.estimators.recurrent_kernels import (
+    N_FEATURES,
+    N_LOOP_FEATURES,
+    Cells,
+    Memory,
+    make_cells,
+    read,
+)
 from dptse_env.evaluation import Row, evaluate
 from dptse_env.model import Channels
 from dptse_env.process import QueryProcess
@@ -32,6 +39,9 @@ from dptse_env.traffic import Corridor, Records, open_library
 from dptse_env.utils.arrays import AnyArray, FloatArray
 from dptse_env.utils.kernels import Bundle
 from dptse_env.vector_env import SensorQueryVectorEnv
+
+N_INPUTS = N_FEATURES + N_LOOP_FEATURES
+"""Features of a network that is trained; one without those of loops reads the first of them."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +59,7 @@ class Episodes:
         sigma: Their deviations, (T, k, M, 2).
         centre: Speeds [km/h] that flows are centred at, (T, k, S).
         inputs: The model's inputs, (T, k, n_u).
+        told: What readings of loop detectors say (`Estimator.hear`), (T, k, S, 6).
         truth: Density [veh/km] and speed [km/h], (T, k, S, 2).
     """
 
@@ -62,11 +73,12 @@ class Episodes:
     sigma: AnyArray
     centre: AnyArray
     inputs: AnyArray
+    told: AnyArray
     truth: AnyArray
 
     def pick(self, chosen: AnyArray) -> Episodes:
         """Return some of the episodes, in double precision."""
-        names = ("observed", "values", "sigma", "centre", "inputs", "truth")
+        names = ("observed", "values", "sigma", "centre", "inputs", "told", "truth")
         arrays = {name: getattr(self, name)[:, chosen] for name in names}
         doubles = {name: arrays[name].astype(float) for name in names[1:]}
         start = self.start[chosen].astype(float)
@@ -113,13 +125,14 @@ def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
         corridor=process.config.corridor,
         is_taught=scenario.is_taught,
         channels=process.model.channels,
-        cells=make_cells(process.model),
+        cells=make_cells(process.model, hears_loops=True),
         start=recorder.start,
         observed=observed,
         values=_single(values),
         sigma=_single(sigma),
         centre=_single(centre),
         inputs=_single(np.stack(recorder.inputs)),
+        told=np.stack(recorder.told),
         truth=np.stack(recorder.truth),
     )
 
@@ -131,6 +144,7 @@ class _Recorder:
         self._estimator, self._process = process.estimator, process
         self.measured: list[tuple[AnyArray, ...]] = []
         self.inputs: list[FloatArray] = []
+        self.told: list[FloatArray] = []
         self.start: AnyArray = np.empty(0)
         self.truth: list[AnyArray] = []
 
@@ -147,6 +161,11 @@ class _Recorder:
         model = self._process.model
         own = measured.on_road(model.channels.size, model.n_segments)
         self.measured.append(tuple(array.copy() for array in own))
+        process = self._process
+        told = np.zeros((len(episodes), model.n_segments, 6))
+        if process.loops is not None:
+            told = process.loops.heard(process.traffic_index[episodes], process.time[episodes])
+        self.told.append(_single(told))
         self._estimator.update(episodes, measured)
 
     def __call__(self) -> None:
@@ -204,25 +223,26 @@ class Batch:
         return Batch(parts) if parts else None
 
     def features(self, t: int, predicted: FloatArray, age: FloatArray) -> Tensor:
-        """Return the features of second t + 1, shape (C, `N_FEATURES`).
+        """Return the features of second t + 1, shape (C, `N_INPUTS`).
 
         Args:
             t: Index of the second.
             predicted: Prediction of that second with its deviations, shape (C, 4).
             age: Seconds since the last measurement, shape (C,); updated.
         """
-        x = np.empty((len(age), N_FEATURES), dtype=np.float32)
+        x = np.empty((len(age), N_INPUTS), dtype=np.float32)
         for part, place in zip(self._parts, self._places, strict=True):
             k = len(part.start)
             memory = Memory(
                 inputs=part.inputs[t],
                 present=predicted[place].reshape(k, -1, 4),
                 age=age[place].reshape(k, -1),
+                told=part.told[t],
                 innovations=np.empty(part.sigma[t].shape),
             )
             measured = Measurement(part.observed[t], part.values[t], part.sigma[t], part.centre[t])
             bundle = Bundle(part.corridor.road, part.channels, part.cells, memory)
-            read(bundle, np.arange(k), measured, x[place].reshape(k, -1, N_FEATURES))
+            read(bundle, np.arange(k), measured, x[place].reshape(k, -1, N_INPUTS))
         return torch.from_numpy(x)
 
 

@@ -26,7 +26,7 @@ from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.recurrent import FORMAT, read_weights
-from dptse_env.estimators.recurrent_kernels import FEATURES
+from dptse_env.estimators.recurrent_kernels import FEATURES, LOOP_FEATURES
 from dptse_env.utils.validation import Interval, checked_fields, integer, require
 from dptse_env.versions import versions_with
 
@@ -243,7 +243,7 @@ class FilterPlan:
         return {
             "name": name,
             "format": FORMAT,
-            "channels": list(FEATURES),
+            "channels": [*FEATURES, *LOOP_FEATURES],
             "ranges": {key: [min(values), max(values)] for key, values in found.items()},
             "training": {
                 "plan": self.settings(),

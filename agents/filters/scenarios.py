@@ -5,6 +5,7 @@ All scenarios of a training come from `ScenarioRanges.draw`. For other roads giv
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from agents.filters.highways import KINDS, draw_highway
 from agents.filters.highways import Kind as HighwayKind
 from agents.filters.sections import SEGMENTS, Section
 from agents.play import Cell
+from dptse_env.traffic import Loops
 from dptse_env.utils.validation import Interval, checked_fields, require
 
 Kind = Literal["flows", "speeds"]
@@ -37,6 +39,12 @@ BOUNDARIES: dict[Kind, dict[str, float]] = {
 """Sources of the boundary inputs, and how likely each is where it is not the usual one."""
 EPSILONS, CAPS = (0.5, 20.0), (24, 128)
 """Ranges of epsilon, and of the cap of ``capped``; drawn log-uniformly."""
+CONNECTED = (0.05, 0.9)
+"""Range of the share of connected vehicles where not all are; drawn log-uniformly."""
+STATIONS, INTERVALS = (0.3, 2.0), (10, 20, 30, 60, 120, 300)
+"""Range of the distance of loop detectors [km], drawn log-uniformly, and their intervals [s]."""
+MISJUDGED = 0.3
+"""Deviation of the logarithm of a section's published demand, in half of them."""
 LITTLE_NOISE, HARDLY_ANY, NONE = 0.25, 1000.0, 1e4
 """Share of scenarios whose epsilon is larger, up to this one, or in one of five none at all."""
 DELTAS = (0.05, 0.001)
@@ -109,7 +117,9 @@ class Scenario(Cell):
     @property
     def is_taught(self) -> bool:
         """Whether initial weights may know such roads and noise, and so may teach."""
-        return self.section is None and self.keywords["privacy"]["epsilon"] <= EPSILONS[1]
+        is_known = self.section is None and self.keywords["privacy"]["epsilon"] <= EPSILONS[1]
+        has_loops = "loops" in self.keywords.get("corridor", {})
+        return is_known and not has_loops and "penetration" not in self.keywords
 
 
 @dataclass(frozen=True)
@@ -121,6 +131,8 @@ class ScenarioRanges:
         sections: Share of the scenarios that are on sections of highways, not in one of `envs`.
         highways: Numbers (first, stop) of these highways; see `numbers_of`.
         free: Share of the sections that are on highways of other kinds than ``queues``.
+        loops: Share of the scenarios with loop detectors.
+        connected: Share of those where not all vehicles are connected.
         schedules: Query schedules.
         spans: Spans of queries under ``paced``.
 
@@ -132,6 +144,8 @@ class ScenarioRanges:
     sections: Annotated[float, Interval(0, 1)] = 0.5
     highways: tuple[int, int] = (0, 80)
     free: Annotated[float, Interval(0, 1)] = 0.5
+    loops: Annotated[float, Interval(0, 1)] = 0.3
+    connected: Annotated[float, Interval(0, 1)] = 0.3
     schedules: tuple[str, ...] = SCHEDULES
     spans: tuple[tuple[int, ...], ...] = ((1,), (2,), (1, 2))
 
@@ -171,10 +185,17 @@ class ScenarioRanges:
         else:
             env, keywords = parse_env(str(rng.choice(self.envs)))
             corridor = make_config(env, keywords).corridor
+            if rng.random() < self.loops:
+                lengths = corridor.geometry.segment_lengths[: corridor.geometry.n_mainline]
+                loops = dataclasses.asdict(_draw_loops(rng, lengths))
+                keywords["corridor"] = {**keywords.get("corridor", {}), "loops": loops}
             n_mainline = corridor.geometry.n_mainline
             drawn = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
             seeds = tuple(int(seed) for seed in drawn)
             keywords |= {"horizon": seconds, "random_start": seconds < corridor.conditions.duration}
+        if rng.random() < self.connected and not (section and section.averaged):
+            share = np.exp(rng.uniform(*np.log(CONNECTED)))
+            keywords["penetration"] = round(float(share), 3)
         privacy = _draw_privacy(rng, mechanism)
         if section is not None or rng.random() < 0.3:
             chances = dict(BOUNDARIES[kind])
@@ -205,13 +226,16 @@ class ScenarioRanges:
         if rng.random() < self.free:
             kind = KINDS[int(rng.integers(1, len(KINDS)))]
         number = int(rng.choice(numbers_of(kind, self.highways)))
-        most = min(draw_highway(number, kind).corridor.geometry.n_mainline - 2, SEGMENTS[1])
+        whole = draw_highway(number, kind).corridor.geometry
+        most = min(whole.n_mainline - 2, SEGMENTS[1])
         fewest = SEGMENTS[0]
         segments = int(np.exp(rng.uniform(np.log(fewest), np.log(min(20, most) + 1.0))))
         if rng.random() < (0.1 if kind == "queues" else 0.4):
             segments = most
         n_sensors = int(rng.choice([0, 1, 2, 3], p=[0.6, 0.2, 0.1, 0.1]))
         sensors = rng.choice(segments, size=n_sensors, replace=False)
+        has_loops = not averaged and rng.random() < self.loops
+        misjudged = float(np.exp(rng.normal(0.0, MISJUDGED))) if rng.random() < 0.5 else 1.0
         return Section(
             number,
             segments,
@@ -221,6 +245,8 @@ class ScenarioRanges:
             sensors=tuple(int(each) for each in sensors),
             seed=int(rng.integers(2**31)),
             kind=kind,
+            loops=_draw_loops(rng, whole.segment_lengths[:segments]) if has_loops else None,
+            misjudged=round(misjudged, 3),
         )
 
 
@@ -228,6 +254,15 @@ def numbers_of(kind: HighwayKind, highways: tuple[int, int]) -> range:
     """Return the numbers of the highways of a kind: of others than ``queues`` the first fifth."""
     first, stop = highways
     return range(first, stop if kind == "queues" else first + -(-(stop - first) // 5))
+
+
+def _draw_loops(rng: np.random.Generator, lengths: Sequence[float]) -> Loops:
+    """Draw loops at borders between segments of some lengths."""
+    borders = np.round(np.concatenate([[0.0], np.cumsum(lengths)]), 6)
+    distance = float(np.exp(rng.uniform(*np.log(STATIONS))))
+    places = np.arange(rng.uniform(0.0, min(distance, borders[-1])), borders[-1], distance)
+    nearest = np.unique(np.abs(borders[:, None] - places).argmin(axis=0))
+    return Loops(tuple(borders[nearest].tolist()), interval=int(rng.choice(INTERVALS)))
 
 
 def _draw_privacy(rng: np.random.Generator, mechanism: str) -> dict[str, Any]:

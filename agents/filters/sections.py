@@ -50,6 +50,7 @@ class Section:
         traffic: Traffic seeds of the highway; windows then begin together, one of each seed, which
             is its own one, too. Where there are none, all windows are of seed 0.
         loops: Loop detectors on the section; None for none.
+        misjudged: Published demand over the measured one.
     """
 
     highway: int
@@ -62,6 +63,7 @@ class Section:
     kind: HighwayKind = "queues"
     traffic: tuple[int, ...] = ()
     loops: Loops | None = None
+    misjudged: float = 1.0
 
     def write(self, folder: Path, library: RecordLibrary) -> Path:
         """Write its road file and records to a folder, and return the path of the file.
@@ -88,6 +90,8 @@ class Section:
             for record, start in zip(records if own else records * len(starts), starts, strict=True)
         ]
         road = measure(bare, lambda: cuts)
+        if self.misjudged != 1.0:
+            road = road.replaced(demand=road.conditions.published_demand.scaled(self.misjudged))
         kind: Kind = "fields" if self.averaged else "vehicles"
         if self.averaged:
             cuts = [_averaged(road, each, self.averaged) for each in cuts]

@@ -258,6 +258,21 @@ class Estimator(ABC):
             np.minimum(estimate.speed, self._largest_speed, out=estimate.speed)
         return estimate
 
+    @property
+    def hears_loops(self) -> bool:
+        """Whether it takes readings of loop detectors by `hear`; they replace measurements else."""
+        return False
+
+    def hear(self, episodes: IntArray, told: FloatArray) -> None:
+        """Take what the last readings of loop detectors say, for the next update.
+
+        Args:
+            episodes: Shape (k,).
+            told: Density [veh/km], speed [km/h] and deviations of both, seconds since the middle of
+                the interval, and its length [s]: shape (k, S, 6), 0 where there is no reading.
+        """
+        raise NotImplementedError
+
     @classmethod
     def goes_back(cls) -> bool:
         """Return whether its episodes can go back in time: it says what it remembers."""

@@ -19,6 +19,7 @@ from dptse_env.estimators.base import SegmentEstimator
 from dptse_env.estimators.recurrent_kernels import (
     FEATURES,
     LONGEST_AGE,
+    LOOP_FEATURES,
     Memory,
     State,
     Weights,
@@ -31,7 +32,7 @@ from dptse_env.estimators.recurrent_kernels import (
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
-from dptse_env.utils.arrays import AnyArray
+from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
 from dptse_env.utils.files import read_tensors, require_arrays, write_tensors
 from dptse_env.utils.kernels import Bundle
 
@@ -72,6 +73,7 @@ class Recurrent(SegmentEstimator):
             inputs=np.zeros((n, model.n_inputs)),
             present=self.present,
             age=np.full((n, S), LONGEST_AGE),
+            told=np.zeros((n, S, 6)),
             innovations=self.innovations,
         )
         state = State(
@@ -82,13 +84,26 @@ class Recurrent(SegmentEstimator):
         )
         self.hidden = state.hidden
         self.arrays = Bundle(
-            model.road, model.channels, make_cells(model), memory, self.saved.weights, state
+            model.road, model.channels, make_cells(model, self.hears_loops), memory,
+            self.saved.weights, state,
         )  # fmt: skip
 
     @property
     def _memory(self) -> tuple[AnyArray, ...]:
         _, _, _, memory, _, state = self.arrays.parts
-        return memory.inputs, memory.present, memory.age, state.hidden, state.ahead, state.priors
+        return (
+            memory.inputs, memory.present, memory.age, memory.told, state.hidden, state.ahead,
+            state.priors,
+        )  # fmt: skip
+
+    @property
+    def hears_loops(self) -> bool:
+        """Whether its weights have readings of loop detectors among their features."""
+        return self.saved.weights.hears_loops
+
+    def hear(self, episodes: IntArray, told: FloatArray) -> None:
+        """Take what the last readings say, for the next update."""
+        self.arrays.parts[3].told[episodes] = told
 
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
@@ -228,7 +243,9 @@ def write_weights(path: str | os.PathLike[str], weights: Weights, card: Mapping[
 
 def _checked(arrays: Mapping[str, AnyArray], card: Mapping[str, Any]) -> Weights:
     """Return the weights of a file's arrays and card, or refuse them."""
-    if card.get("format") != FORMAT or card.get("channels") != list(FEATURES):
+    channels = card.get("channels")
+    hears_loops = channels == [*FEATURES, *LOOP_FEATURES]
+    if card.get("format") != FORMAT or not (hears_loops or channels == list(FEATURES)):
         raise ValueError(
             f"it has features of format {card.get('format')!r}, this version reads {FORMAT!r}"
         )
@@ -242,5 +259,5 @@ def _checked(arrays: Mapping[str, AnyArray], card: Mapping[str, Any]) -> Weights
     width = len(arrays["hidden"]) if "hidden" in arrays and arrays["hidden"].ndim else 0
     if not 1 <= width <= LARGEST_WIDTH:
         raise ValueError(f"its width must be in 1..{LARGEST_WIDTH}, got {width}")
-    require_arrays(arrays, shapes(width), np.float32)
+    require_arrays(arrays, shapes(width, hears_loops), np.float32)
     return Weights(**arrays)

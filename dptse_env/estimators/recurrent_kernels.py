@@ -50,6 +50,13 @@ FEATURES = (
 )  # fmt: skip
 """The features of a cell."""
 N_FEATURES = len(FEATURES)
+LOOP_FEATURES = (
+    "told", "told_density", "told_speed", "log_told_density_deviation", "log_told_speed_deviation",
+    "log_told_age", "log_interval",
+)  # fmt: skip
+"""Further features of a cell beside a station of loop detectors, in networks that hear of them:
+that there is a reading, what it says of the cell, and how old and how long its interval is."""
+N_LOOP_FEATURES = len(LOOP_FEATURES)
 
 LONGEST_AGE = 300.0
 """Seconds since a measurement after which a cell counts as never measured."""
@@ -87,9 +94,10 @@ class Cells(NamedTuple):
     limit: float  # largest speed limit [km/h], the unit of speeds
     flows: bool  # whether flows are released, otherwise speeds
     fixed: FloatArray  # (S, N_FIXED) features
+    hears_loops: bool  # whether `LOOP_FEATURES` follow
 
 
-def make_cells(model: ARZModel) -> Cells:
+def make_cells(model: ARZModel, hears_loops: bool = False) -> Cells:
     """Return the fixed features of a model's road."""
     road, S = model.road, model.n_segments
     n_on = road.entries.size - 1
@@ -105,6 +113,7 @@ def make_cells(model: ARZModel) -> Cells:
         limit=float(limits.max()),
         flows=model.releases_flow,
         fixed=np.concatenate([marks, lanes[:, None] / 3.0, scales], axis=1),
+        hears_loops=hears_loops,
     )
 
 
@@ -123,15 +132,20 @@ class Weights(NamedTuple):
         """Width H of the hidden state."""
         return len(self.hidden)
 
+    @property
+    def hears_loops(self) -> bool:
+        """Whether `LOOP_FEATURES` are among the C features."""
+        return len(self.inputs) > N_FEATURES + 2 * message_width(self.width)
+
 
 def message_width(width: int) -> int:
     """Return the size M of a message in a network of some width."""
     return min(width, MESSAGE)
 
 
-def shapes(width: int) -> dict[str, tuple[int, ...]]:
+def shapes(width: int, hears_loops: bool = False) -> dict[str, tuple[int, ...]]:
     """Return the shapes of `Weights` of some width by name."""
-    n_inputs = N_FEATURES + 2 * message_width(width)
+    n_inputs = N_FEATURES + N_LOOP_FEATURES * hears_loops + 2 * message_width(width)
     return {
         "inputs": (n_inputs, 3 * width),
         "inputs_bias": (3 * width,),
@@ -148,6 +162,9 @@ class Memory(NamedTuple):
     inputs: FloatArray  # (n, n_u) the model's inputs of the last prediction
     present: FloatArray  # (n, S, 4) predictions, then estimates, and their deviations
     age: FloatArray  # (n, S) seconds since the last measurement
+    # (n, S, 6) density, speed, deviations of both, age of the middle of the interval and its length
+    # [s], of the last reading; 0 where there is none
+    told: FloatArray
     innovations: FloatArray  # (n, M, 2)
 
 
@@ -174,6 +191,7 @@ def _restart(memory: Memory, state: State, e: int) -> None:
     memory.present[e] = state.priors[e]
     state.ahead[e] = state.priors[e]
     memory.age[e] = LONGEST_AGE
+    memory.told[e] = 0.0
     memory.innovations[e] = 0.0
 
 
@@ -213,10 +231,10 @@ def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Ar
             parts may follow.
         episodes: Shape (k,).
         measured: The release of the k episodes.
-        x: Output, shape (k, S, `N_FEATURES` or more).
+        x: Output, shape (k, S, C or more).
     """
     road, channels, cells, memory = bundle.parts[:4]
-    inputs, present, age, innovations = memory
+    inputs, present, age, told, innovations = memory
     S = road.n_segments
     sums, second = np.empty((S, 10)), np.empty((S, 4))
     outside = np.empty((S, 2))
@@ -248,6 +266,8 @@ def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Ar
             row[18], row[19] = outside[s, 0], outside[s, 1]
             for j in range(N_FIXED):
                 row[20 + j] = cells.fixed[s, j]
+            if cells.hears_loops:
+                _write_told(told[episode, s], cells.unit[s], cells.limit, row[N_FEATURES:])
             age[episode, s] = 0.0 if sums[s, 0] > 0.0 else age[episode, s] + 1.0
 
 
@@ -324,6 +344,17 @@ def _write(
     row[17] = 0.25 * np.log(1.0 + min(age, LONGEST_AGE))
 
 
+@inline_part
+def _write_told(told: FloatArray, unit: float, limit: float, row: Float32Array) -> None:
+    """Write `LOOP_FEATURES` of a cell; 0 where no reading says anything of it."""
+    row[:N_LOOP_FEATURES] = 0.0
+    if told[2] > 0.0:
+        row[0], row[1], row[2] = 1.0, told[0] / unit, told[1] / limit
+        row[3] = 0.25 * np.log(told[2] / unit)
+        row[4] = 0.25 * np.log(min(told[3] / limit, LARGEST_CORRECTION))
+        row[5], row[6] = 0.25 * np.log(1.0 + told[4]), 0.25 * np.log(told[5])
+
+
 @kernel_part
 def _correction(value: float) -> float:
     return clip(value, -LARGEST_CORRECTION, LARGEST_CORRECTION)
@@ -341,18 +372,19 @@ def advance(bundle: Bundle, episodes: IntArray, x: Float32Array) -> None:
     road, _, cells, memory, weights, state = bundle.parts
     present, hidden, ahead = memory.present, state.hidden, state.ahead
     S, H = road.n_segments, weights.hidden.shape[0]
-    M = (weights.inputs.shape[0] - N_FEATURES) // 2
+    M = min(H, MESSAGE)
+    C = weights.inputs.shape[0] - 2 * M
     g, q = np.empty((S, 3 * H), dtype=np.float32), np.empty((S, 3 * H), dtype=np.float32)
     raw = np.empty((S, weights.heads.shape[1]), dtype=np.float32)
     # One product for each episode: its bits then do not depend on the batch that it is in.
     for i in range(episodes.size):
         h = hidden[episodes[i]]
-        x[i, :, N_FEATURES:] = 0.0
+        x[i, :, C:] = 0.0
         for e in range(road.edges.shape[0]):
             start, end = road.edges[e, 0], road.edges[e, 1]
             for j in range(M):
-                x[i, end, N_FEATURES + j] += h[start, j]
-                x[i, start, N_FEATURES + M + j] += h[end, j]
+                x[i, end, C + j] += h[start, j]
+                x[i, start, C + M + j] += h[end, j]
         np.dot(x[i], weights.inputs, g)
         np.dot(h, weights.hidden, q)
         for s in range(S):

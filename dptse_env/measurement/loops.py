@@ -151,7 +151,7 @@ class LoopReadings:
         channels = task.queries.channels_of_segments(corridor)[segments]
         least_density = 1.0 / road.lengths[segments]
         self._places = Bundle(Places(channels, segments, least_density, task.releases_flow))
-        self._limit = road.limits[segments]
+        self._segments, self._limit = segments, road.limits[segments]
         self._tells = np.isin(np.arange(self.interval), seconds_told(self.interval))
         # Pairs of a station and a segment beside it.
         pairs = np.arange(len(beside)).repeat(2), place.reshape(-1)
@@ -210,6 +210,20 @@ class LoopReadings:
             Density, speed and deviations of both, shape (k, L, 4); NaN where nothing is said.
         """
         found: FloatArray = self._said[traffic, times // self.interval - 1]
+        return found
+
+    def heard(self, traffic: IntArray, times: IntArray) -> FloatArray:
+        """Return what the last readings say at seconds (k,), as `Estimator.hear` takes it."""
+        road, interval = self._traffic.corridor.road, self.interval
+        found = np.zeros((len(times), road.n_segments, 6))
+        known = times >= interval
+        said = self.said_until(traffic[known], times[known])
+        rows = np.concatenate([said, np.empty((*said.shape[:2], 2))], axis=-1)
+        rows[..., 2:4] /= np.count_nonzero(self._tells) ** 0.5
+        rows[..., 4] = (times[known] % interval + 0.5 * interval)[:, None]
+        rows[..., 5] = interval
+        rows[np.isnan(rows[..., 0])] = 0.0
+        found[np.ix_(known, self._segments)] = rows
         return found
 
     def added(self, measured: Measurement, said: FloatArray, seconds: IntArray) -> Measurement:

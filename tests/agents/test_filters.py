@@ -14,7 +14,14 @@ from agents.filters.collecting import Batch, collect, draw_batch  # noqa: E402
 from agents.filters.highways import KINDS, LENGTHS, LIMITS, draw_highway  # noqa: E402
 from agents.filters.network import RecurrentNetwork, second_loss, teacher_loss  # noqa: E402
 from agents.filters.plan import OWN, FilterPlan, Round, played_by  # noqa: E402
-from agents.filters.scenarios import MECHANISMS, ROADS, SCHEDULES, ScenarioRanges  # noqa: E402
+from agents.filters.scenarios import (  # noqa: E402
+    CONNECTED,
+    INTERVALS,
+    MECHANISMS,
+    ROADS,
+    SCHEDULES,
+    ScenarioRanges,
+)
 from agents.filters.sections import FILLED, Section  # noqa: E402
 from agents.filters.training import WEIGHTS, FilterTraining  # noqa: E402
 from agents.training.run_files import PROGRESS, read_progress  # noqa: E402
@@ -27,7 +34,7 @@ from tests.agents.training.plans import StopError, ended_at, stop  # noqa: E402
 from tests.estimators.helpers import card  # noqa: E402
 from tests.helpers import SHORT  # noqa: E402
 
-RANGES = ScenarioRanges(envs=(SHORT,), sections=0.0, spans=((1,), (1, 2)))
+RANGES = ScenarioRanges(envs=(SHORT,), sections=0.0, loops=0.0, connected=0.0, spans=((1,), (1, 2)))
 PLAN = FilterPlan(
     kind="flows",
     seed=3,
@@ -52,6 +59,24 @@ def _one_thread():
 
 
 # Scenarios ----------------------------------------------------------------------------------------
+
+
+def test_some_scenarios_have_loops_and_few_connected_vehicles():
+    ranges = dataclasses.replace(RANGES, loops=0.5, connected=0.5)
+    scenarios = drawn(ranges, n=60)
+    with_loops = [each for each in scenarios if "corridor" in each.keywords]
+    assert 15 < len(with_loops) < 45
+    assert not any(each.is_taught for each in with_loops)
+    loops = [each.keywords["corridor"]["loops"] for each in with_loops]
+    assert {each["interval"] for each in loops} == set(INTERVALS)
+    for each in with_loops[:5]:
+        make_config(each.env, each.keywords)
+    shares = [each.keywords["penetration"] for each in scenarios if "penetration" in each.keywords]
+    assert 15 < len(shares) < 45
+    assert CONNECTED[0] <= min(shares) < max(shares) <= CONNECTED[1]
+    on_sections = [each.section for each in drawn(ranges, n=40, on_section=True)]
+    assert 0 < sum(each.loops is not None for each in on_sections) < 40
+    assert 0 < sum(each.misjudged != 1.0 for each in on_sections) < 40
 
 
 def drawn(ranges=RANGES, n=60, seed=0, kind="flows", on_section=False):
@@ -252,24 +277,33 @@ def steps(network, batch, n):
 def mixed(mechanism, env=SHORT):
     """Return a scenario with a release model."""
     kind = next(kind for kind, known in MECHANISMS.items() if mechanism in known)
-    ranges = dataclasses.replace(PLAN.ranges, envs=(env,), spans=((1, 2),))
+    # One that does not draw at random: two evaluations draw other numbers.
+    ranges = dataclasses.replace(
+        PLAN.ranges, envs=(env,), spans=((1, 2),), schedules=("oldest-first",)
+    )
     plan = dataclasses.replace(PLAN, kind=kind, ranges=ranges, rounds=(Round("ekf", 20, 1),))
     return next(
         each
         for each in plan.scenarios(0)
-        if each.is_taught and each.keywords["privacy"]["preset"] == mechanism
+        if each.keywords["privacy"]["epsilon"] <= 20.0
+        and each.keywords["privacy"]["preset"] == mechanism
     )
 
 
-@pytest.mark.parametrize("mechanism", ["printed", "paced"])
-def test_the_network_with_gradients_is_the_estimator(mechanism, tmp_path):
+LOOPS = json.dumps({"corridor": {"loops": {"positions": [0.0, 0.3], "interval": 20}}})
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "env"), [("printed", SHORT), ("paced", SHORT), ("paced", f"{SHORT} {LOOPS}")]
+)
+def test_the_network_with_gradients_is_the_estimator(mechanism, env, tmp_path):
     """Torch makes of collected releases the estimates that the environment reported."""
     torch.manual_seed(0)
     network = RecurrentNetwork(5)
     with torch.no_grad():
         network.heads.normal_(0.0, 0.5)
-    write_weights(tmp_path / "weights.safetensors", network.weights(), card())
-    own, scenario = played_by(tmp_path / "weights.safetensors"), mixed(mechanism)
+    write_weights(tmp_path / "weights.safetensors", network.weights(), card(hears_loops=True))
+    own, scenario = played_by(tmp_path / "weights.safetensors"), mixed(mechanism, env)
     collected = collect(scenario, own, None)
     keywords = {**scenario.keywords, **own, "traffic_seeds": list(scenario.seeds)}
     env, seen = make_vector(SHORT, 2, {**keywords, "action": "scores"}), Seen()

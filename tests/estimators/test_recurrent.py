@@ -40,7 +40,7 @@ def of_weights(episodes, folder, weights=None, **ranges):
 # Beside the network that is trained ---------------------------------------------------------------
 
 
-def features(model, measured, inputs, prior, age):
+def features(model, measured, inputs, prior, age, told=None):
     """The features and innovations of one episode, as the module's docstring has them.
 
     All rows and cells are treated at once.
@@ -51,6 +51,7 @@ def features(model, measured, inputs, prior, age):
         inputs: The model's inputs, shape (n_u,).
         prior: Predictions and deviations, shape (S, 4).
         age: Seconds since the last measurement of each cell, shape (S,).
+        told: What readings of loop detectors say, shape (S, 6); None for no such features.
     """
     cells, flows = make_cells(model), float(model.centre is not None)
     observed, values, sigma, centre = (part[0] for part in measured)
@@ -91,6 +92,15 @@ def features(model, measured, inputs, prior, age):
         slip / limit, np.full(len(v), flows), 0.25 * np.log(1.0 + np.minimum(age, LONGEST_AGE)),
         *outside, *cells.fixed.T,
     ]  # fmt: skip
+    if told is not None:
+        there, (density, speed, density_std, speed_std, since, interval) = told[:, 2] > 0, told.T
+        with np.errstate(divide="ignore"):
+            further = [
+                there, density / unit, speed / limit, 0.25 * np.log(density_std / unit),
+                0.25 * np.log(np.minimum(speed_std / limit, 2.0)), 0.25 * np.log(1.0 + since),
+                0.25 * np.log(interval),
+            ]  # fmt: skip
+        numbers += [np.where(there, each, 0.0) for each in further]
     age[:] = np.where(n > 0, 0.0, age + 1.0)
     return np.stack(numbers, axis=-1), innovations
 
@@ -101,7 +111,8 @@ class Twin:
     def __init__(self, estimator):
         self.model, n = estimator.model, estimator.n_episodes
         cells = make_cells(self.model)
-        self.network = trained.RecurrentNetwork(estimator.saved.weights.width)
+        weights = estimator.saved.weights
+        self.network = trained.RecurrentNetwork(weights.width, weights.hears_loops)
         self.network.take(estimator.saved.weights)
         S = self.model.n_segments
         edges = self.model.road.edges + S * np.arange(n)[:, None, None]
@@ -120,11 +131,12 @@ class Twin:
         self.hidden = torch.zeros(n * S, self.network.width)
         self.age = np.full(self.ahead.shape[:2], LONGEST_AGE)
 
-    def step(self, inputs, given):
+    def step(self, inputs, given, told=None):
         """Return the estimates and deviations after a step, and before the next `(n, S, 4)`."""
+        told = [None] * len(self.ahead) if told is None else told
         both = [
             features(self.model, [part[k : k + 1] for part in given], inputs[k], *prior)
-            for k, prior in enumerate(zip(self.ahead, self.age, strict=True))
+            for k, prior in enumerate(zip(self.ahead, self.age, told, strict=True))
         ]
         x, self.innovations = (np.stack(each) for each in zip(*both, strict=True))
         with torch.no_grad():
@@ -146,20 +158,32 @@ def _double():
 
 @pytest.mark.usefixtures("_double")
 @pytest.mark.parametrize(
-    ("release", "width", "noise"), [("speed", 8, 1.0), ("flow", 20, 10.0), ("rows", 8, 1.0)]
+    ("release", "width", "noise", "hears_loops"),
+    [
+        ("speed", 8, 1.0, False),
+        ("flow", 20, 10.0, False),
+        ("rows", 8, 1.0, False),
+        ("flow", 20, 1.0, True),
+    ],
 )
-def test_it_is_the_network_that_is_trained(release, width, noise, tmp_path):
+def test_it_is_the_network_that_is_trained(release, width, noise, hears_loops, tmp_path):
     """Messages are all of the hidden state, or a part of it, in single precision.
 
     What is far off is held to a range.
     """
     episodes = simulate(n=3, n_steps=40, noise=noise, release=release)
-    estimator = of_weights(episodes, tmp_path, random_weights(width))
-    twin, far = Twin(estimator), []
+    estimator = of_weights(episodes, tmp_path, random_weights(width, hears_loops))
+    assert estimator.hears_loops == hears_loops
+    twin, far, told = Twin(estimator), [], None
+    rng, shape = np.random.default_rng(1), (3, episodes.model.n_segments, 6)
     for k in range(40):
+        if hears_loops:
+            told = rng.uniform(1.0, 200.0, shape) * (rng.random(shape[:2]) < 0.5)[..., None]
+            told[0, 0, 3] = 1e5
+            estimator.hear(episodes.everyone, told)
         step(estimator, episodes, k)
         given = Measurement.of(episodes.model, **episodes.released(k, episodes.everyone))
-        present, ahead = twin.step(episodes.inputs[k], given)
+        present, ahead = twin.step(episodes.inputs[k], given, told)
         hidden = twin.hidden.reshape(estimator.hidden.shape)
         np.testing.assert_allclose(estimator.hidden, hidden, atol=1e-5)
         np.testing.assert_allclose(estimator.means, present[..., :2], rtol=1e-5, atol=1e-3)
