@@ -15,6 +15,7 @@ from typing import Annotated, Any, NamedTuple
 from dptse_env.estimators import (
     ESTIMATORS,
     Estimator,
+    Played,
     check_estimator,
     checked_settings,
 )
@@ -683,8 +684,8 @@ def _inherited(
         found.append("estimator_settings")
     centre = config.release_model.centre(corridor, config.privacy)
     estimator: type[Estimator] = ESTIMATORS.find(config.estimator)
-    spans = max(config.query_spans)
-    found += estimator.inherits(corridor.road, centre is not None, spans, config.settings())
+    played = _played(config, centre is not None)
+    found += estimator.inherits(corridor.road, played, config.settings())
     return tuple(found)
 
 
@@ -697,3 +698,26 @@ def _is_untuned(config: EnvConfig, is_other: bool) -> bool:
     if name is None:
         return is_tuned(config.estimator) and config.privacy.preset in RELEASE_MODELS
     return is_other or is_of_another_road(name, config.corridor.name)
+
+
+def _played(config: EnvConfig, flows: bool) -> Played:
+    """Return the numbers of an environment that cards of weights may name."""
+    conditions, share = config.corridor.conditions, config.penetration.share
+    limit = config.corridor.geometry.largest_speed_limit
+    slow = [
+        each
+        for each in conditions.vehicle_classes
+        if each.largest_speed is not None and each.largest_speed < limit
+    ]
+    headways = [each.headway for each in (conditions.drivers, *(v.drivers for v in slow)) if each]
+    loops = config.corridor.loops
+    return {
+        "flows": (flows,),
+        "span": (max(config.query_spans),),
+        "epsilon": (config.privacy.epsilon,),
+        "connected": share if isinstance(share, tuple) else (share,),
+        "slow_share": (sum(each.share for each in slow),),
+        "slow_speed": [each.largest_speed for each in slow if each.largest_speed is not None],
+        "headway": [each for each in headways if each is not None],
+        "loop_interval": () if loops is None else (loops.interval,),
+    }

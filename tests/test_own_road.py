@@ -16,6 +16,7 @@ from dptse_env.model import load_parameters
 from dptse_env.model.parameters import write_parameters
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.traffic import write_corridor
+from tests.estimators.helpers import weights_settings
 from tests.helpers import UNEVEN, fast_and_slow, play
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
@@ -74,6 +75,23 @@ def test_weights_on_a_road_unlike_those_of_their_training_are_named(road_file):
         env = gym.make(ID, corridor=road_file, traffic_seeds=[0], estimator="recurrent")
     assert name in env.reset(seed=0)[1]["inherited"]
     assert gym.make(ID, estimator="recurrent").unwrapped.config.inherited == ()
+
+
+def test_traffic_and_noise_beyond_the_card_of_weights_are_named(tmp_path):
+    ranges = {"slow_share": [0.0, 0.2], "epsilon": [0.5, 20.0]}
+    settings = weights_settings(tmp_path, **ranges)
+    lorry = {"name": "lorry", "length": 12.0, "largest_speed": 85.0}
+
+    def inherited(share, epsilon):
+        classes = [{"name": "car", "share": 1.0 - share}, {**lorry, "share": share}]
+        keywords = {"corridor": {"vehicle_classes": classes}, "epsilon": epsilon}
+        env = gym.make(ID, estimator="recurrent", estimator_settings=settings, **keywords)
+        return env.unwrapped.config.inherited
+
+    assert inherited(0.1, 5.0) == ()
+    for share, epsilon in ((0.3, 5.0), (0.1, 100.0)):
+        with pytest.warns(UserWarning, match="recurrent.weights: values measured"):
+            assert inherited(share, epsilon) == ("estimator_settings.recurrent.weights",)
 
 
 def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):

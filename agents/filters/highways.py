@@ -39,6 +39,10 @@ HEADWAYS = {"W99": (0.7, 1.6), "IDM": (0.9, 1.9), "Krauss": (0.8, 1.6)}
 """Desired time headways of drivers by their model [s]."""
 LORRIES, LORRY_SPEEDS = (0.0, 0.4), (75.0, 95.0)
 """Ranges of the share of lorries, and of their largest speed [km/h]."""
+CONVOYS, LOADS = (25.0, 50.0), (20.0, 50.0)
+"""Ranges of the speeds of convoys and of moving loads [km/h]."""
+QUEUE_LORRIES = (0.03, 0.2)
+"""Range of the share of lorries on highways with queues."""
 FREE_SPEEDS = (0.7, 1.15)
 """Range of the speed that drivers want, over the limit."""
 UNLIMITED = (150.0, 180.0, 200.0)
@@ -84,7 +88,7 @@ def _draw_queues(number: int) -> Corridor:
     model = str(rng.choice(["W99", "IDM", "Krauss"], p=[0.4, 0.35, 0.25]))
     classes: tuple[VehicleClass, ...] = ()
     if rng.random() < 0.4:
-        trucks = round(float(rng.uniform(0.03, 0.2)), 3)
+        trucks = round(float(rng.uniform(*QUEUE_LORRIES)), 3)
         slow = VehicleClass("truck", trucks, length=12.0, largest_speed=90.0)
         classes = (VehicleClass("car", 1.0 - trucks), slow)
     faces = _draw_ramps(rng, n)
@@ -204,7 +208,7 @@ def _draw_free(rng: np.random.Generator, number: int, kind: Kind) -> Highway:
     elif kind == "convoys":
         slow = round(float(rng.uniform(0.001, 0.006)), 4)
         car = dataclasses.replace(classes[0], share=classes[0].share - slow)
-        speed = round(float(rng.uniform(25.0, 50.0)), 1)
+        speed = round(float(rng.uniform(*CONVOYS)), 1)
         classes = (car, *classes[1:], VehicleClass("convoy", slow, 12.0, largest_speed=speed))
     model = str(rng.choice(["W99", "IDM", "Krauss"], p=[0.4, 0.35, 0.25]))
     geometry = Geometry(
@@ -251,7 +255,7 @@ def _draw_lorries(rng: np.random.Generator, most: float) -> tuple[VehicleClass, 
 
 def _draw_load(rng: np.random.Generator, n: int, length: float) -> tuple[Incident, ...]:
     """Return limits that move along the road with a load, over some 300 m of it."""
-    speed, start = float(rng.uniform(20.0, 50.0)), float(rng.uniform(100.0, 500.0))
+    speed, start = float(rng.uniform(*LOADS)), float(rng.uniform(100.0, 500.0))
     crossing, behind = HOUR * length / speed, HOUR * 0.3 / speed
     limits: list[Incident] = []
     for k in range(int(rng.integers(0, n // 2)), n):

@@ -18,9 +18,30 @@ from typing import Annotated, Any
 import numpy as np
 
 from agents.environments import PRIVATE, make_config, parse_env, quietly
-from agents.filters.highways import KINDS, LANES, LENGTHS, LIMITS, draw_highway
+from agents.filters.highways import (
+    CONVOYS,
+    HEADWAYS,
+    KINDS,
+    LANES,
+    LENGTHS,
+    LIMITS,
+    LORRIES,
+    LORRY_SPEEDS,
+    QUEUE_LORRIES,
+    draw_highway,
+)
 from agents.filters.highways import Kind as HighwayKind
-from agents.filters.scenarios import MECHANISMS, Kind, Scenario, ScenarioRanges, numbers_of
+from agents.filters.scenarios import (
+    CONNECTED,
+    EPSILONS,
+    INTERVALS,
+    MECHANISMS,
+    NONE,
+    Kind,
+    Scenario,
+    ScenarioRanges,
+    numbers_of,
+)
 from agents.filters.sections import SEGMENTS, Section
 from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
@@ -234,17 +255,30 @@ class FilterPlan:
             "lanes": [float(count) for road in roads for count in road.geometry.segment_lanes],
             "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
             "flows": [float(self.kind == "flows")],
+            "epsilon": [EPSILONS[0], NONE],
+            "connected": [CONNECTED[0], 1.0] if ranges.connected > 0.0 else [1.0],
+            "slow_share": [0.0],
+            "headway": [
+                each.conditions.drivers.headway
+                for each in roads
+                if each.conditions.drivers.headway is not None
+            ],
         }
+        if ranges.loops > 0.0:
+            found["loop_interval"] = [float(each) for each in INTERVALS]
         if ranges.sections > 0.0:
             found["n_mainline"] += SEGMENTS
             found["segment_length"] += LENGTHS
             found["speed_limit"] += LIMITS
             found["lanes"] += LANES
+            found["slow_share"] += LORRIES if ranges.free > 0.0 else QUEUE_LORRIES
+            found["slow_speed"] = [CONVOYS[0], LORRY_SPEEDS[1]] if ranges.free > 0.0 else [90.0]
+            found["headway"] += [each for pair in HEADWAYS.values() for each in pair]
         return {
             "name": name,
             "format": FORMAT,
             "channels": [*FEATURES, *LOOP_FEATURES],
-            "ranges": {key: [min(values), max(values)] for key, values in found.items()},
+            "ranges": {key: [min(values), max(values)] for key, values in found.items() if values},
             "training": {
                 "plan": self.settings(),
                 "passes": done,

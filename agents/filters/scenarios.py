@@ -187,7 +187,7 @@ class ScenarioRanges:
             corridor = make_config(env, keywords).corridor
             if rng.random() < self.loops:
                 lengths = corridor.geometry.segment_lengths[: corridor.geometry.n_mainline]
-                loops = dataclasses.asdict(_draw_loops(rng, lengths))
+                loops = dataclasses.asdict(_draw_loops(rng, lengths, seconds))
                 keywords["corridor"] = {**keywords.get("corridor", {}), "loops": loops}
             n_mainline = corridor.geometry.n_mainline
             drawn = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
@@ -203,9 +203,12 @@ class ScenarioRanges:
                 chances["nominal"] += chances.pop("private")  # a field has no vehicles to protect
             source = rng.choice(list(chances), p=list(chances.values()))
             privacy["boundary_inputs"] = str(source)
+        has_loops = "loops" in keywords.get("corridor", {}) or (section and section.loops)
         largest = n_mainline
         if mechanism == "paced":
-            spans = self.spans[int(rng.integers(len(self.spans)))]
+            # Readings say something of one segment, so that it must be a query.
+            suitable = [each for each in self.spans if 1 in each or not has_loops] or [(1,)]
+            spans = suitable[int(rng.integers(len(suitable)))]
             if spans != (1,):
                 keywords |= {"query_spans": list(spans), "bandwidth_unit": "sums"}
                 largest = max(2 * n_mainline // 3, 1)
@@ -235,6 +238,8 @@ class ScenarioRanges:
         n_sensors = int(rng.choice([0, 1, 2, 3], p=[0.6, 0.2, 0.1, 0.1]))
         sensors = rng.choice(segments, size=n_sensors, replace=False)
         has_loops = not averaged and rng.random() < self.loops
+        lengths = whole.segment_lengths[:segments]
+        loops = _draw_loops(rng, lengths, seconds) if has_loops else None
         misjudged = float(np.exp(rng.normal(0.0, MISJUDGED))) if rng.random() < 0.5 else 1.0
         return Section(
             number,
@@ -245,7 +250,7 @@ class ScenarioRanges:
             sensors=tuple(int(each) for each in sensors),
             seed=int(rng.integers(2**31)),
             kind=kind,
-            loops=_draw_loops(rng, whole.segment_lengths[:segments]) if has_loops else None,
+            loops=loops,
             misjudged=round(misjudged, 3),
         )
 
@@ -256,13 +261,14 @@ def numbers_of(kind: HighwayKind, highways: tuple[int, int]) -> range:
     return range(first, stop if kind == "queues" else first + -(-(stop - first) // 5))
 
 
-def _draw_loops(rng: np.random.Generator, lengths: Sequence[float]) -> Loops:
-    """Draw loops at borders between segments of some lengths."""
+def _draw_loops(rng: np.random.Generator, lengths: Sequence[float], seconds: int) -> Loops:
+    """Draw loops at borders between segments of some lengths, for episodes of some seconds."""
     borders = np.round(np.concatenate([[0.0], np.cumsum(lengths)]), 6)
     distance = float(np.exp(rng.uniform(*np.log(STATIONS))))
     places = np.arange(rng.uniform(0.0, min(distance, borders[-1])), borders[-1], distance)
+    interval = int(rng.choice([each for each in INTERVALS if each <= seconds]))
     nearest = np.unique(np.abs(borders[:, None] - places).argmin(axis=0))
-    return Loops(tuple(borders[nearest].tolist()), interval=int(rng.choice(INTERVALS)))
+    return Loops(tuple(borders[nearest].tolist()), interval=interval)
 
 
 def _draw_privacy(rng: np.random.Generator, mechanism: str) -> dict[str, Any]:

@@ -3,7 +3,14 @@
 from pkgutil import resolve_name
 from typing import Any, get_args
 
-from dptse_env.estimators.base import Backend, Estimate, Estimator, KernelEstimator, Measurement
+from dptse_env.estimators.base import (
+    Backend,
+    Estimate,
+    Estimator,
+    KernelEstimator,
+    Measurement,
+    Played,
+)
 from dptse_env.estimators.settings import (
     AdaptiveSmoothingSettings,
     BlendSettings,
@@ -35,6 +42,7 @@ __all__ = [
     "KernelEstimator",
     "Measurement",
     "MixtureSettings",
+    "Played",
     "RecurrentSettings",
     "SigmaPointSettings",
     "check_estimator",

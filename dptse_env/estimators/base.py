@@ -8,7 +8,7 @@ change.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -23,6 +23,26 @@ from dptse_env.utils.registry import name_of_class
 from dptse_env.utils.validation import require
 
 Backend = Literal["compiled", "reference"]
+
+Played = Mapping[str, Sequence[float]]
+"""Numbers of an environment by name, as cards of weights have ranges of them:
+
+``flows``
+    1 where flows are released, 0 where speeds are.
+``span``
+    Largest number of segments of a query.
+``epsilon``
+    Privacy loss.
+``connected``
+    Share of connected vehicles.
+``slow_share``, ``slow_speed``
+    Share of the vehicles of classes that are slower than the limit, and their largest speeds
+    [km/h].
+``headway``
+    Desired time headways of drivers [s], where they are given.
+``loop_interval``
+    Interval of loop detectors [s].
+"""
 
 
 class Estimate(NamedTuple):
@@ -199,13 +219,12 @@ class Estimator(ABC):
         """
 
     @classmethod
-    def inherits(cls, road: Road, flows: bool, largest_span: int, settings: Any) -> tuple[str, ...]:
-        """Return the settings that were made for other roads or releases than these.
+    def inherits(cls, road: Road, played: Played, settings: Any) -> tuple[str, ...]:
+        """Return the settings that were made for other roads, traffic or releases than these.
 
         Args:
             road: The road.
-            flows: Whether flows are released, not speeds.
-            largest_span: Largest number of segments of a query.
+            played: What is played on it.
             settings: The settings.
         """
         return ()

@@ -6,8 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from dptse_env.estimators.base import Estimate, Estimator, Measurement
-from dptse_env.estimators.recurrent import Recurrent
+from dptse_env.estimators.base import Estimate, Estimator, Measurement, Played
+from dptse_env.estimators.recurrent import SHIPPED, Recurrent, weights_for
 from dptse_env.estimators.settings import EstimatorSettings, RecurrentSettings
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
@@ -43,7 +43,8 @@ class Mixture(Estimator):
         super().__init__(model, n_episodes, settings)
         self._fading = 1.0 - model.time_step / settings.mixture.memory
         self.experts: list[Estimator] = [
-            kind(model, n_episodes, own) for kind, own in _experts(settings)
+            kind(model, n_episodes, own)
+            for kind, own in _experts(settings, model.road, model.releases_flow)
         ]
         self._likelihoods = np.zeros((len(self.experts), n_episodes))
         self._priors = np.zeros((n_episodes, 2 * model.n_segments))
@@ -54,18 +55,16 @@ class Mixture(Estimator):
         """Refuse settings that an expert cannot have on the road."""
         from dptse_env.estimators import check_settings  # noqa: PLC0415 (which names this module)
 
-        for kind, own in _experts(settings):
+        for kind, own in _experts(settings, model.road, model.releases_flow):
             with within("estimator_settings.mixture.experts: "):
                 check_settings(kind, model, own)
 
     @classmethod
-    def inherits(
-        cls, road: Road, flows: bool, largest_span: int, settings: EstimatorSettings
-    ) -> tuple[str, ...]:
+    def inherits(cls, road: Road, played: Played, settings: EstimatorSettings) -> tuple[str, ...]:
         """Return the setting of the experts where no weights were trained on such roads."""
         found = [
-            bool(kind.inherits(road, flows, largest_span, own))
-            for kind, own in _experts(settings)
+            bool(kind.inherits(road, played, own))
+            for kind, own in _experts(settings, road, bool(played["flows"][0]))
             if issubclass(kind, Recurrent)
         ]
         return ("estimator_settings.mixture.experts",) if found and all(found) else ()
@@ -150,7 +149,9 @@ class Mixture(Estimator):
         return Estimate(*means, *np.sqrt((weights[:, None] * squares).sum(axis=0)))
 
 
-def _experts(settings: EstimatorSettings) -> list[tuple[type[Estimator], EstimatorSettings]]:
+def _experts(
+    settings: EstimatorSettings, road: Road, flows: bool
+) -> list[tuple[type[Estimator], EstimatorSettings]]:
     """Return the classes and settings of the experts; other names are those of weights.
 
     Raises:
@@ -159,10 +160,19 @@ def _experts(settings: EstimatorSettings) -> list[tuple[type[Estimator], Estimat
     from dptse_env.estimators import ESTIMATORS  # noqa: PLC0415 (which names this module)
 
     found: list[tuple[type[Estimator], EstimatorSettings]] = []
-    for name in settings.mixture.experts:
+    for name in settings.mixture.experts or _weights_on(road, flows):
         if name in ESTIMATORS or ":" in name:
             found.append((ESTIMATORS.find(name), settings))
         else:
             own = dataclasses.replace(settings, recurrent=RecurrentSettings(name))
             found.append((Recurrent, own))
     return found
+
+
+def _weights_on(road: Road, flows: bool) -> tuple[str, str]:
+    """Return the weights that `Recurrent` would take on a road, and those of most kinds of roads.
+
+    Where these are the same, they come second, after the first of `SHIPPED`.
+    """
+    own, (first, *_, last) = weights_for(None, road, flows).source.rpartition("-")[0], SHIPPED
+    return (own, last) if own != last else (first, last)

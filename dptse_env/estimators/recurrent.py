@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from dptse_env.estimators.base import SegmentEstimator
+from dptse_env.estimators.base import Played, SegmentEstimator
 from dptse_env.estimators.recurrent_kernels import (
     FEATURES,
     LONGEST_AGE,
@@ -112,31 +112,23 @@ class Recurrent(SegmentEstimator):
         weights_for(settings.recurrent.weights, model.road, flows)
 
     @classmethod
-    def inherits(
-        cls, road: Road, flows: bool, largest_span: int, settings: EstimatorSettings
-    ) -> tuple[str, ...]:
-        """Return the setting of the weights where they were trained on other roads or releases.
-
-        Args:
-            road: The road.
-            flows: Whether flows are released, not speeds.
-            largest_span: Largest number of segments of a query.
-            settings: The settings.
-        """
-        saved = weights_for(settings.recurrent.weights, road, flows)
-        is_outside = outside(saved, road, flows, largest_span)
-        return ("estimator_settings.recurrent.weights",) if is_outside else ()
+    def inherits(cls, road: Road, played: Played, settings: EstimatorSettings) -> tuple[str, ...]:
+        """Return the setting of the weights where their card does not name what is played."""
+        saved = weights_for(settings.recurrent.weights, road, bool(played["flows"][0]))
+        return ("estimator_settings.recurrent.weights",) if outside(saved, road, played) else ()
 
 
-def outside(saved: SavedWeights, road: Road, flows: bool, largest_span: int) -> list[str]:
-    """Return the properties of a road and its releases that weights were not trained on."""
+def outside(saved: SavedWeights, road: Road, played: Played) -> list[str]:
+    """Return the properties of a road, its traffic and releases that weights do not know.
+
+    Ranges that a card lacks hold for everything.
+    """
     found: dict[str, Sequence[float]] = {
         "n_mainline": (road.n_mainline,),
         "segment_length": road.lengths.tolist(),
         "speed_limit": road.limits.tolist(),
         "lanes": road.lanes.tolist(),
-        "span": (largest_span,),
-        "flows": (flows,),
+        **played,
     }
     return [
         name
@@ -176,7 +168,7 @@ def weights_for(source: str | None, road: Road, flows: bool) -> SavedWeights:
         return read_weights(member_for(source, flows))
     members = (member_for(name, flows) for name in SHIPPED)
     for saved in (read_weights(each) for each in members if each in shipped_weights()):
-        if not outside(saved, road, flows, 1):
+        if not outside(saved, road, {"flows": (flows,)}):
             break
     return saved
 

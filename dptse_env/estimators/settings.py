@@ -179,18 +179,19 @@ class MixtureSettings(_Checked, path=f"{PATH}.mixture"):
     """Settings of the mixture.
 
     Attributes:
-        experts: Two or more names of estimators or of weights (`RecurrentSettings`).
-            They share all other settings.
+        experts: Two or more names of estimators or of weights (`RecurrentSettings`), which share
+            all other settings; None for the weights that `recurrent` takes on the road, and
+            ``roads``. Where it takes these, ``highway`` is the other expert.
         memory: Seconds in which likelihoods are forgotten.
     """
 
-    experts: tuple[str, ...] = ("highway", "roads")
+    experts: tuple[str, ...] | None = None
     memory: Annotated[float, Interval(2, 3600)] = 60.0
 
     def __post_init__(self) -> None:
         """Check values; lists become tuples."""
         super().__post_init__()
-        if len(self.experts) < 2 or "mixture" in self.experts:
+        if self.experts is not None and (len(self.experts) < 2 or "mixture" in self.experts):
             raise ValueError(
                 f"{PATH}.mixture.experts must be two or more names of other estimators or of "
                 f"weights, got {shown(self.experts)}"

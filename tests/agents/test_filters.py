@@ -68,8 +68,8 @@ def test_some_scenarios_have_loops_and_few_connected_vehicles():
     assert 15 < len(with_loops) < 45
     assert not any(each.is_taught for each in with_loops)
     loops = [each.keywords["corridor"]["loops"] for each in with_loops]
-    assert {each["interval"] for each in loops} == set(INTERVALS)
-    for each in with_loops[:5]:
+    assert {each["interval"] for each in loops} == {each for each in INTERVALS if each <= 240}
+    for each in with_loops:
         make_config(each.env, each.keywords)
     shares = [each.keywords["penetration"] for each in scenarios if "penetration" in each.keywords]
     assert 15 < len(shares) < 45

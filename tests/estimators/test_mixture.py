@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from dptse_env.estimators import EstimatorSettings, MixtureSettings, make_estimator
+from dptse_env.estimators.mixture import _weights_on
+from dptse_env.traffic import CORRIDORS
 
 from .helpers import RELEASES, model_of, run, simulate, started, step, update
 
@@ -85,6 +87,18 @@ def test_an_expert_is_an_estimator_or_the_name_of_weights():
     model = model_of("published", "speed")
     mixture = make_estimator("mixture", "compiled", model, 1, EstimatorSettings())
     assert [each.saved.source for each in mixture.experts] == ["highway-speeds", "roads-speeds"]
+
+
+@pytest.mark.parametrize(
+    ("road", "flows", "experts"),
+    [
+        ("paper-highway", True, ["highway", "roads"]),
+        ("long-highway", True, ["long-highway", "roads"]),
+        ("long-highway", False, ["highway", "roads"]),
+    ],
+)
+def test_the_first_expert_is_what_recurrent_takes_on_the_road(road, flows, experts):
+    assert list(_weights_on(CORRIDORS[road].road, flows)) == experts
 
 
 def test_settings_that_an_expert_cannot_have_are_refused():

@@ -234,6 +234,12 @@ def test_deviations_and_estimates_stay_in_their_range(tmp_path):
     np.testing.assert_allclose(estimate.density_std[0], unit * np.exp(LOWEST_SPREAD))
 
 
+PLAYED = {
+    "flows": (False,), "span": (3,), "epsilon": (100.0,), "connected": (0.1, 1.0),
+    "slow_share": (0.3,), "slow_speed": (80.0,), "headway": (),
+}  # fmt: skip
+
+
 def test_what_weights_were_not_trained_on_is_named(tmp_path):
     path, road = tmp_path / "weights.safetensors", PAPER_HIGHWAY
     for ranges, names in (
@@ -241,9 +247,11 @@ def test_what_weights_were_not_trained_on_is_named(tmp_path):
         ({"n_mainline": [3, 9]}, ["n_mainline"]),
         ({"span": [1, 2], "flows": [1, 1]}, ["span", "flows"]),
         ({"lanes": [2, 3], "speed_limit": [80.0, 100.0]}, ["speed_limit", "lanes"]),
+        ({"epsilon": [0.5, 20.0], "slow_share": [0.0, 0.2]}, ["epsilon", "slow_share"]),
+        ({"slow_speed": [25.0, 95.0], "headway": [1.0, 2.0], "loop_interval": [10, 300]}, []),
     ):
         write_weights(path, random_weights(), {**card(), "ranges": ranges})
-        assert set(outside(read_weights(str(path)), road.road, False, 3)) == set(names)
+        assert set(outside(read_weights(str(path)), road.road, PLAYED)) == set(names)
 
 
 # Files of weights ---------------------------------------------------------------------------------
