@@ -61,6 +61,7 @@ def _one_thread():
 # Scenarios ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:.* yet no privacy is guaranteed")
 def test_some_scenarios_have_loops_and_few_connected_vehicles():
     ranges = dataclasses.replace(RANGES, loops=0.5, connected=0.5)
     scenarios = drawn(ranges, n=60)
