@@ -41,7 +41,7 @@ from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, Val
 
 NAME = "weights"
 """Name of the pair of weights in the output folder."""
-CONTINUED: dict[str, Any] = {"learning_rate": 1.5e-3, "teacher": 0.5}
+CONTINUED: dict[str, Any] = {"learning_rate": 1.5e-3, "teacher": 0.5, "checkpoint_every": 160}
 """Fields of a plan that begins with trained weights."""
 
 
@@ -56,9 +56,9 @@ class Args(Output, Machines, ValidationSeeds, TrainSeeds, Environments, Command)
     random highways; nine roads if not given."""
     validation_env: tuple[str, ...] = ()
     """Environments to validate in, with a round robin, beside sections of other highways."""
-    rounds: tuple[str, ...] = ("own:96:64",) * 7
+    rounds: tuple[str, ...] = ("own:96:80",) * 12
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
-    initial: str | None = "highway"
+    initial: str | None = "roads"
     """Pair of weights to begin with, which also teaches; None for random ones."""
     plan: str = "{}"
     """Further fields of the plan (agents/filters/plan.py) as JSON."""
