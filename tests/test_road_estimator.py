@@ -207,7 +207,7 @@ def test_a_station_is_read_by_lanes_length_and_limit_of_the_road(estimator):
         np.array(2400.0), np.array(45.0), 60, road.lanes[0], road.lengths[0], road.limits[0]
     )
     alike = np.array([1.0, 1.0, 6.0**0.5, 6.0**0.5])  # told six times, with alike errors
-    each = Seen(0.0, 0.2, *(np.array(said) * alike).tolist())
+    each = Seen(0.0, 0.2, *(np.array(said[:4]) * alike).tolist())
     for second in range(1, 61):
         by_density.step([each] if second % 10 == 6 else [])
     np.testing.assert_allclose(bits(by_flow), bits(by_density), rtol=1e-9)

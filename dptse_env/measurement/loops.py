@@ -1,8 +1,9 @@
 """Loops: what their readings say of the segments beside them.
 
 Readings are public before the releases and no part of any budget. A reading comes at the end of its
-interval and is told in the middle of it: `dptse_env.measurement.rewind`. Were it told in every
-second, with errors that are alike, estimators would take its noise for what traffic did.
+interval and is told within it: `dptse_env.measurement.rewind`. It is of a mean. So each second is
+told what an estimator took it for, moved by what the mean lacks. Were the mean told as the value of
+each second, a jam that came within the interval would be smoothed away.
 """
 
 import math
@@ -24,7 +25,7 @@ SPACING, HEADWAY = 8.0, 1.4
 """Distance of vehicles that stand [m], and what it grows by with their speed [s]."""
 STANDING = 75.0
 """Density of a lane that a jam has more than its flow tells, where nobody passes [veh/km]."""
-SLOWED = 0.2
+SLOWED = 0.37
 """Part of what vehicles in a jam are slower than flow and density tell."""
 QUEUE, LEAST_QUEUE, EMPTIED = 130.0, 0.02, 40.0
 """Density of a lane that stands where nothing passed [veh/km]; the others are empty. Share of those
@@ -38,6 +39,8 @@ DENSITY_WAVES, SPEED_WAVES = 25.0, 16.0
 RAMP_SPEEDS, RAMP_SPREAD = 0.4, 0.3
 """Speeds on a ramp are those at its mouth, where vehicles brake, over a + (1 - a) v / limit. Part
 of a density there that waves are, in intervals of up to 30 s."""
+WAVE = 40.0
+"""Time in which waves pass [s]: in longer intervals little is left of them in the mean."""
 DENSITY_FAR, SPEED_FAR = 3.0, 10.0
 """Growth of deviations with the length of a segment, far from jams [lane^-1 km^-2, h^-1]."""
 STRETCH = 10
@@ -53,6 +56,8 @@ class Said(NamedTuple):
     speed: FloatArray  # [km/h]
     density_std: FloatArray
     speed_std: FloatArray
+    density_shared: FloatArray  # deviations of the interval's mean, which all seconds share
+    speed_shared: FloatArray
 
 
 def seconds_told(interval: int) -> IntArray:
@@ -82,7 +87,8 @@ def interpreted(
     empty. The density is the mean of both.
 
     Variances are those of the number on a segment, of the number that passed, and of waves in a
-    jam; of speeds those of the vehicles' own ones and of waves.
+    jam; of speeds those of the vehicles' own ones and of waves. All seconds of an interval share
+    errors of the number that passed, and of waves the part 40 / (40 + T) in an interval of T s.
 
     Fitted to readings at all borders in training traffic of the built-in roads (seeds 0 to 7), in
     intervals of 10 to 300 s. Mean squared errors over variances by class of speed:
@@ -100,36 +106,42 @@ def interpreted(
     passed, silent = flow > 0.0, np.isnan(flow)
     v = np.where(passed, np.maximum(speed, LEAST_SPEED), limit)
     told = flow / lanes / v
-    shift, spread = 0.06 * np.log(interval / 60.0), (interval / 60.0) ** 0.2
+    longer, spread = np.log(interval / 60.0), (interval / 60.0) ** 0.2
 
-    def jam(middle: float) -> FloatArray:
-        share: FloatArray = 0.5 + 0.5 * np.tanh((middle + shift - v / limit) / 0.2)
+    def jam(middle: float, width: float, shift: float) -> FloatArray:
+        share: FloatArray = 0.5 + 0.5 * np.tanh((middle + shift * longer - v / limit) / width)
         return share
 
     moving = 1000.0 / (SPACING + HEADWAY * v / KMH)
     braked = RAMP_SPEEDS + (1.0 - RAMP_SPEEDS) * np.minimum(v / limit, 1.0)
-    standing = STANDING * np.maximum(1.0 - told / moving, 0.0) * jam(0.53)
+    standing = STANDING * np.maximum(1.0 - told / moving, 0.0) * jam(0.6, 0.11, 0.02)
     density = np.where(is_ramp, told * braked, told + standing)
     slower = SLOWED * v * (1.0 - told / np.maximum(density, 1e-9))
     mean = np.where(is_ramp, np.minimum(v / braked, limit), v - slower)
     single = FLICKER * (density + 1.0) / lanes
     seen = v * interval / HOUR  # [km] that passes in an interval
     ramp_waves = RAMP_SPREAD * told * np.maximum(interval / 30.0, 1.0) ** 0.5
-    waves = np.where(is_ramp, ramp_waves, spread * DENSITY_WAVES * jam(0.6))
+    waves = np.where(is_ramp, ramp_waves, spread * DENSITY_WAVES * jam(0.6, 0.2, 0.06))
     density_waves = waves**2 * (1.0 + length)
-    common = single * COUNTED / seen + (DENSITY_FAR * length) ** 2 + density_waves
-    own = OWN_SPEED**2 / (1.0 + density * lanes * length) + (SPEED_FAR * length) ** 2
-    speed_waves = (spread * SPEED_WAVES * jam(0.85)) ** 2
+    counts = single * COUNTED / seen + (DENSITY_FAR * length) ** 2
+    apart = (SPEED_FAR * length) ** 2
+    speed_waves = (spread * SPEED_WAVES * jam(0.85, 0.2, 0.06)) ** 2
     queue = LEAST_QUEUE + np.where(is_ramp, QUEUES[1], QUEUES[0]) * np.exp(-interval / EMPTIED)
     density = np.where(passed, density, QUEUE * queue)
-    common = np.where(passed, common, QUEUE**2 * queue * (1.0 - queue))
-    each = np.where(passed, single / length, 0.0)
-    density = np.where(silent, np.nan, lanes * density)
+    counts = np.where(passed, counts, 0.0)
+    density_waves = np.where(passed, density_waves, QUEUE**2 * queue * (1.0 - queue))
+    # How many vehicles are on the segment, and which ones, is of each second alone.
+    number = np.where(passed, single / length, 0.0)
+    own = OWN_SPEED**2 / (1.0 + density * lanes * length)
+    lasting = WAVE / (WAVE + interval)
+    heard, seen_moving = np.where(silent, np.nan, lanes), np.where(passed, 1.0, np.nan)
     return Said(
-        density,
-        np.where(passed, mean, np.nan),
-        lanes * np.sqrt(common + each) + 0.0 * density,
-        np.where(passed, np.sqrt(own + speed_waves), np.nan),
+        density=heard * density,
+        speed=seen_moving * mean,
+        density_std=heard * np.sqrt(counts + density_waves + number),
+        speed_std=seen_moving * np.sqrt(apart + speed_waves + own),
+        density_shared=heard * np.sqrt(counts + lasting * density_waves),
+        speed_shared=seen_moving * np.sqrt(apart + lasting * speed_waves),
     )
 
 
@@ -138,6 +150,8 @@ class LoopReadings:
 
     Attributes:
         interval: Length of an interval [s].
+        seconds: The N of its seconds in which an estimator is told, from 0 on.
+        segments: The L segments.
     """
 
     def __init__(self, task: Task, traffic: Traffic) -> None:
@@ -151,8 +165,11 @@ class LoopReadings:
         channels = task.queries.channels_of_segments(corridor)[segments]
         least_density = 1.0 / road.lengths[segments]
         self._places = Bundle(Places(channels, segments, least_density, task.releases_flow))
-        self._segments, self._limit = segments, road.limits[segments]
-        self._tells = np.isin(np.arange(self.interval), seconds_told(self.interval))
+        self.segments, self._limit = segments, road.limits[segments]
+        self.seconds = seconds_told(self.interval)
+        # Index into them of each second of an interval, -1 where nothing is told.
+        self._telling = np.full(self.interval, -1)
+        self._telling[self.seconds] = np.arange(len(self.seconds))
         # Pairs of a station and a segment beside it.
         pairs = np.arange(len(beside)).repeat(2), place.reshape(-1)
         self._station, place = np.unique(np.array(pairs), axis=1)
@@ -160,7 +177,7 @@ class LoopReadings:
         on_ramp = beside >= road.n_mainline
         self._pairs = road.lanes[beside], road.lengths[beside], road.limits[beside], on_ramp
         self._mean = np.eye(segments.size)[place]  # (pairs, L)
-        shape = traffic.readings.shape[1], segments.size, 4
+        shape = traffic.readings.shape[1], segments.size, len(Said._fields)
         self._said = traffic.derived(shape, self._said_of)
 
     def last(self, traffic: IntArray, times: IntArray) -> FloatArray:
@@ -188,6 +205,7 @@ class LoopReadings:
         return means._replace(
             speed=np.where(untold, self._limit, means.speed),
             speed_std=np.where(untold, UNKNOWN, means.speed_std),
+            speed_shared=np.where(untold, 0.0, means.speed_shared),
         )
 
     def _averaged(self, values: FloatArray) -> FloatArray:
@@ -198,16 +216,15 @@ class LoopReadings:
         return means
 
     def _said_of(self, index: int) -> FloatArray:
-        """Return what is said in all intervals of a record, (K, L, 4)."""
+        """Return what is said in all intervals of a record, (K, L, 6)."""
         said: FloatArray = np.stack(self.said(self._traffic.readings[index]), axis=-1)
-        said[..., 2:] *= np.count_nonzero(self._tells) ** 0.5  # errors of an interval are alike
         return said
 
     def said_until(self, traffic: IntArray, times: IntArray) -> FloatArray:
-        """Return what is said of the intervals that end at seconds (k,), each time it is told.
+        """Return what is said of the intervals that end at seconds (k,).
 
         Returns:
-            Density, speed and deviations of both, shape (k, L, 4); NaN where nothing is said.
+            The fields of `Said`, shape (k, L, 6); NaN where nothing is said.
         """
         found: FloatArray = self._said[traffic, times // self.interval - 1]
         return found
@@ -218,25 +235,46 @@ class LoopReadings:
         found = np.zeros((len(times), road.n_segments, 6))
         known = times >= interval
         said = self.said_until(traffic[known], times[known])
-        rows = np.concatenate([said, np.empty((*said.shape[:2], 2))], axis=-1)
-        rows[..., 2:4] /= np.count_nonzero(self._tells) ** 0.5
+        rows = said.copy()
         rows[..., 4] = (times[known] % interval + 0.5 * interval)[:, None]
         rows[..., 5] = interval
         rows[np.isnan(rows[..., 0])] = 0.0
-        found[np.ix_(known, self._segments)] = rows
+        found[np.ix_(known, self.segments)] = rows
         return found
 
-    def added(self, measured: Measurement, said: FloatArray, seconds: IntArray) -> Measurement:
+    def told(self, said: FloatArray, estimated: FloatArray) -> FloatArray:
+        """Return what the N seconds are told, by what an estimator took them for before.
+
+        z_i = s + min(s / m, 1) (x_i - m), with estimates x_i, their mean m and the mean s that is
+        said: their course is kept, and where it is scaled down, nothing falls below 0.
+
+        Args:
+            said: What `said_until` returns of k episodes.
+            estimated: Densities and speeds x, shape (N, k, L, 2); NaN before an episode began.
+
+        Returns:
+            Densities, speeds and their deviations, shape (N, k, L, 4).
+        """
+        known = np.isfinite(estimated)
+        total, n = np.where(known, estimated, 0.0).sum(axis=0), known.sum(axis=0)
+        mean = total / np.maximum(n, 1)
+        share = np.minimum(said[..., :2] / np.maximum(mean, 1e-9), 1.0)
+        values = said[..., :2] + np.where(known, share * (estimated - mean), 0.0)
+        more = (len(estimated) - 1) ** 0.5  # so that shared errors count once
+        std = np.hypot(said[..., 2:4], more * said[..., 4:])
+        return np.concatenate([values, np.broadcast_to(std, values.shape)], axis=-1)
+
+    def added(self, measured: Measurement, told: FloatArray, seconds: IntArray) -> Measurement:
         """Return the measurement of some seconds with what readings say, where they are told.
 
         Where a segment is measured in the same second, both are weighed by their variances.
 
         Args:
             measured: Of m seconds of k episodes, one after the other, m k rows.
-            said: What `said_until` returns of the k episodes.
+            told: What `told` returns of them.
             seconds: Seconds of the interval, from 0 on, shape (m,).
         """
-        observed, values, sigma = merge(self._places, measured, said, self._tells[seconds])
+        observed, values, sigma = merge(self._places, measured, told, self._telling[seconds])
         return measured._replace(observed=observed, values=values, sigma=sigma)
 
 
@@ -251,17 +289,18 @@ class Places(NamedTuple):
 
 @kernel
 def merge(
-    bundle: Any, measured: Measurement, said: FloatArray, tells: BoolArray
+    bundle: Any, measured: Measurement, told: FloatArray, telling: IntArray
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Return the first fields of a `Measurement`, see `LoopReadings.added`."""
     (places,) = bundle.parts
     observed, values = measured.observed.copy(), measured.values.copy()
-    sigma = measured.sigma.copy()
+    sigma, n = measured.sigma.copy(), told.shape[1]
     for row in range(len(observed)):
-        if not tells[row // len(said)]:
+        time = telling[row // n]
+        if time < 0:
             continue
         for i in range(places.channel.size):
-            density, speed, density_std, speed_std = said[row % len(said), i]
+            density, speed, density_std, speed_std = told[time, row % n, i]
             if np.isnan(density):
                 continue
             second, second_std, c = speed, speed_std, places.channel[i]

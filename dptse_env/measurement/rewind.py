@@ -1,8 +1,8 @@
 """Rewind: an estimator goes through an interval again, with what is known at its end.
 
-A reading of an interval belongs to its middle. So the estimator's state is kept once an interval,
-and what it was given since: inputs, and the numbers of the channels that were observed. When the
-readings come, it goes back to that state, and takes them in the seconds `seconds_told`.
+A reading is of a whole interval. So the estimator's state is kept once an interval, and what it was
+given since: inputs, and the numbers of the channels that were observed. When the readings come, it
+goes back to that state, and takes them in some seconds, by what it estimated of these before.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ class Rewind:
         self._first = np.zeros(estimator.n_episodes, dtype=np.int64)
         shape, most = (loops.interval, estimator.n_episodes), task.queries.most_queries
         numbers = (*shape, most + len(task.always), 2)
+        beside = len(loops.seconds), estimator.n_episodes, loops.segments.size, 2
+        self._estimated = np.full(beside, np.nan)
         # np.zeros takes address space, not memory, until seconds are kept.
         log = Log(
             inputs=np.zeros((*shape, estimator.model.n_inputs)),
@@ -70,6 +72,7 @@ class Rewind:
         """Begin episodes (k,) at seconds of the record (k,), with the estimator's present state."""
         self._keep(episodes)
         self._first[episodes] = times % self._loops.interval
+        self._estimated[:, episodes] = np.nan
 
     def _keep(self, episodes: IntArray) -> None:
         for kept, array in zip(self._kept, self.estimator.memory, strict=True):
@@ -92,7 +95,13 @@ class Rewind:
             inputs: The model's inputs of its prediction, shape (k, n_u).
             measured: The measurement that it was updated by.
         """
-        keep(self._log, (times - 1) % self._loops.interval, episodes, inputs, measured)
+        seconds = (times - 1) % self._loops.interval
+        keep(self._log, seconds, episodes, inputs, measured)
+        row, second = np.nonzero(seconds[:, None] == self._loops.seconds)
+        if row.size:
+            estimate = self.estimator.estimate().at(episodes[row])
+            found = np.stack([estimate.density, estimate.speed], axis=-1)
+            self._estimated[second, episodes[row]] = found[:, self._loops.segments]
         ends = times % self._loops.interval == 0
         if ends.any():
             self._threads.run(self._again, episodes[ends], (traffic[ends], times[ends]), _block_of)
@@ -112,12 +121,13 @@ class Rewind:
         for kept, array in zip(self._kept, estimator.memory, strict=True):
             array[episodes] = kept[episodes]
         said = self._loops.said_until(traffic, times)
+        told = self._loops.told(said, self._estimated[:, episodes])
         interval, size = self._loops.interval, max(BLOCK // k, 1)
         for begin in range(first[0], interval, size):
             seconds = np.arange(begin, min(begin + size, interval))
             inputs, observed, values, sigma, centre = recall(self._log, seconds, episodes)
             measured = Measurement(observed, values, sigma, centre)
-            given = self._loops.added(measured, said, seconds)
+            given = self._loops.added(measured, told, seconds)
             # Episodes that began within the interval join in later.
             for i, n in enumerate(np.searchsorted(first, seconds, "right").tolist()):
                 live = episodes[:n]

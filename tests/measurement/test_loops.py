@@ -108,9 +108,10 @@ def test_intervals_of_a_few_seconds_are_refused(interval):
 
 
 def misfits(corridor, seeds, interval, library):
-    """Class of speed, and mean squared error over variance of density and speed, by reading.
+    """Class of speed, and squared errors over variances of density and speed, by reading.
 
-    Classes are those of the speed over the limit: below .25, .5, .75, above; 4 where nobody passed.
+    In the mean of all seconds, and then of the mean over the interval. Classes are those of the
+    speed over the limit: below .25, .5, .75, above; 4 where nobody passed.
     """
     geometry, road = corridor.geometry, corridor.road
     ramps = sorted([*geometry.on_ramps, *geometry.off_ramps])
@@ -131,7 +132,10 @@ def misfits(corridor, seeds, interval, library):
         classes = np.where(count > 0, np.digitize(speed / limit, (0.25, 0.5, 0.75)), 4)
         with warnings.catch_warnings(action="ignore"):  # means of nothing
             means = np.nanmean(square, axis=1), np.nanmean(slip, axis=1)
-        found.append(np.stack([classes, *means], axis=-1).reshape(-1, 3))
+            moving = np.nanmean(np.where(truth[..., 0] > 0.0, truth[..., 1], np.nan), axis=1)
+        wrong = (truth[..., 0].mean(axis=1) - said.density) / said.density_shared
+        shared = wrong**2, ((moving - said.speed) / said.speed_shared) ** 2
+        found.append(np.stack([classes, *means, *shared], axis=-1).reshape(-1, 5))
     return np.concatenate(found)
 
 
@@ -149,9 +153,11 @@ def test_deviations_are_those_of_readings_of_test_traffic(interval, least, most)
             found.append(misfits(corridor, range(2000, 2000 + n_seeds), interval, library))
     table = np.concatenate(found)
     for speeds in range(4):
-        density, speed = np.nanmean(table[table[:, 0] == speeds, 1:], axis=0)
+        density, speed, *shared = np.nanmean(table[table[:, 0] == speeds, 1:], axis=0)
         assert least < density < most, (speeds, density, speed)
         assert least < speed < most, (speeds, density, speed)
+        # Those of the mean are rougher; in ten seconds the mean is told once, with the whole.
+        assert interval == 10 or 0.15 < min(shared) <= max(shared) < 6.0, (speeds, shared)
     nobody = table[table[:, 0] == 4, 1]
     assert nobody.size == 0 or nobody.mean() < most
 
@@ -174,30 +180,23 @@ def errors(seeds, preset, n_queries, **keywords):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("penetration", [1.0, 0.2])
+@pytest.mark.parametrize("penetration", [1.0, 0.2, 0.1])
 @pytest.mark.parametrize("estimator", ["recurrent", "ekf", "ukf", "enkf", "mhe", "blend", "asm"])
 def test_loops_make_no_estimate_worse(estimator, penetration):
-    """The upper end of the interval of the error's growth is below 2 %, paired over 32 seeds.
-
-    Adaptive smoothing, which has no traffic model, loses more where every vehicle answers, and the
-    MHE differs from seed to seed too much to tell.
-    """
+    """No growth of the error is certain to exceed half a per cent, paired over 16 seeds."""
     given = {"estimator": estimator, "bandwidth": 5}
     if penetration < 1.0:
         given |= {"penetration": penetration}
     if penetration < 1.0 and estimator == "recurrent":
         given["fusion"] = {"dwell_factor": 1}
-    seeds = range(1000, 1032)
+    seeds = range(1000, 1016)
     road = "private-highway", 5
     without = errors(seeds, *road, **given)
-    for interval in (10, 20, 60, 300):
+    for interval in (20, 60, 300):
         loops = {"positions": [0.0, 0.5, 1.0, 1.5], "interval": interval}
-        growth = (
-            errors(seeds, *road, **given, loops=loops) / without.mean() - without / without.mean()
-        )
-        half = 2.04 * growth.std(ddof=1) / len(growth) ** 0.5
-        most = {"asm": 0.07, "mhe": 0.06}.get(estimator, 0.02)
-        assert growth.mean() + half < most, (interval, growth.mean(), half)
+        growth = (errors(seeds, *road, **given, loops=loops) - without) / without.mean()
+        half = 2.13 * growth.std(ddof=1) / len(growth) ** 0.5
+        assert growth.mean() - half < 0.005, (interval, growth.mean(), half)
 
 
 @pytest.mark.slow
@@ -205,18 +204,14 @@ def test_loops_make_no_estimate_worse(estimator, penetration):
 @pytest.mark.parametrize("n_queries", [0, 1, 5])
 @pytest.mark.parametrize("estimator", ["recurrent", "ekf", "ukf", "enkf", "blend", "asm"])
 def test_stations_at_all_borders_make_no_estimate_worse(estimator, n_queries, preset):
-    """The mean growth of the error over 16 seeds is below 4 %.
-
-    On the short highway the network without a query loses 14 % to readings of a minute.
-    """
+    """The mean growth of the error over 16 seeds is below 2 %."""
     borders = borders_of(resolve(preset, {}).corridor.geometry).tolist()
     given, seeds = {"estimator": estimator, "bandwidth": 5}, range(1000, 1016)
     without = errors(seeds, preset, n_queries, **given).mean()
     for interval in (10, 20, 60):
         loops = {"positions": borders, "interval": interval}
         growth = errors(seeds, preset, n_queries, **given, loops=loops).mean() / without - 1.0
-        known = (estimator, n_queries, preset, interval) == ("recurrent", 0, "short-highway", 60)
-        assert growth < (0.2 if known else 0.04), (interval, growth)
+        assert growth < 0.02, (interval, growth)
 
 
 # A network that hears of them ---------------------------------------------------------------------
@@ -235,6 +230,6 @@ def test_a_network_hears_what_the_last_interval_said(tmp_path):
         assert told.any() == (second >= 20)
     read = process.traffic.readings[process.traffic_index, 1]
     beside, said = np.unique(process.config.corridor.stations.beside), process.loops.said(read)
-    np.testing.assert_allclose(told[:, beside, :4], np.stack(said, axis=-1))
+    np.testing.assert_allclose(told[:, beside, :4], np.stack(said[:4], axis=-1))
     np.testing.assert_array_equal(told[:, beside, 4:], np.full((2, len(beside), 2), (15.0, 20.0)))
     assert not told[:, np.setdiff1d(np.arange(told.shape[1]), beside)].any()

@@ -54,7 +54,9 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_time(estimator, priva
     """At each interval's end, bit for bit, but for what it says of the releases of this second."""
     process = begun(estimator=estimator, privacy=privacy)
     by_hand, given = copy.deepcopy(process.estimator), {e: [] for e in ALL.tolist()}
-    kept = process.rewind.follow
+    kept, beside = process.rewind.follow, process.loops.segments
+    # Of the one second that is told, without the interval's readings; NaN where it was not lived.
+    estimated = np.full((1, len(ALL), len(beside), 2), np.nan)
 
     def spy(episodes, traffic, times, inputs, measured):
         for k, episode in enumerate(episodes.tolist()):
@@ -62,6 +64,10 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_time(estimator, priva
             seen = own.observed[..., None]  # the rest may be anything, and is not kept
             own = own._replace(values=own.values * seen, sigma=own.sigma * seen)
             given[episode].append((inputs[k : k + 1].copy(), own))
+        now = (times - 1) % T == seconds_told(T)
+        found = process.estimator.estimate()
+        own = np.stack([found.density[:, beside], found.speed[:, beside]], axis=-1)
+        estimated[0, episodes[now]] = own[episodes[now]]
         kept(episodes, traffic, times, inputs, measured)
 
     process.rewind.follow = spy
@@ -72,10 +78,11 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_time(estimator, priva
             own = np.array([episode])
             loops = process.loops
             said = loops.said_until(process.traffic_index[own], process.time[own])
+            told = loops.told(said, estimated[:, own])
             n = len(given[episode])  # fewer than an interval where the episode began within
             for second, (inputs, measured) in enumerate(given[episode], T - n):
                 by_hand.predict(own, inputs)
-                by_hand.update(own, loops.added(measured, said, np.array([second])))
+                by_hand.update(own, loops.added(measured, told, np.array([second])))
             given[episode].clear()
             for name in ("innovations", "diverged", "fallback"):
                 getattr(by_hand, name)[own] = getattr(process.estimator, name)[own]
@@ -96,8 +103,9 @@ def test_what_is_known_of_a_segment_in_a_second_is_weighed_by_its_variance(priva
         generator.uniform(20.0, 90.0, (shape[0], task.n_cells)),
     )  # fmt: skip
     said = loops.said_until(process.traffic_index, np.array([2, 5, 9, 20]) * T)
-    given = loops.added(measured, said, np.array([5, 5]))
-    untold = loops.added(measured, said, np.array([4, 6]))
+    told = loops.told(said, np.full((1, *said.shape[:2], 2), np.nan))
+    given = loops.added(measured, told, np.array([5, 5]))
+    untold = loops.added(measured, told, np.array([4, 6]))
     for own, other in zip(untold, measured, strict=True):
         np.testing.assert_array_equal(own, other)
     beside = np.unique(task.corridor.stations.beside)
@@ -117,6 +125,40 @@ def test_what_is_known_of_a_segment_in_a_second_is_weighed_by_its_variance(priva
     mean = (weight * own + other * measured.values[:, beside]) / (weight + other)
     np.testing.assert_allclose(given.values[:, beside], mean)
     np.testing.assert_allclose(given.sigma[:, beside], (weight + other) ** -0.5)
+
+
+def test_a_reading_is_of_the_mean_and_leaves_an_estimate_its_course():
+    """Of three seconds of 60 in which an estimate rises, and of one episode that begins late."""
+    loops = begun(loops=LOOPS | {"interval": 30}).loops
+    n = loops.segments.size
+    said = np.tile([60.0, 40.0, 5.0, 3.0], (2, n, 1))
+    estimated = np.stack([[30.0, 80.0], [40.0, 60.0], [80.0, 40.0]])[:, None, None]
+    estimated = np.tile(estimated, (1, 2, n, 1))
+    estimated[:2, 1] = np.nan
+    told = loops.told(said, estimated)
+    np.testing.assert_allclose(told[..., 2:], np.tile(said[..., 2:], (3, 1, 1, 1)))
+    # Densities 10 below the reading in the mean are moved, speeds 20 above it scaled down.
+    np.testing.assert_allclose(told[:, 0, 0, :2], [[40, 160 / 3], [50, 40], [90, 80 / 3]])
+    np.testing.assert_allclose(told[2, 1, :, :2], said[1, :, :2])
+    empty = loops.told(said, np.zeros_like(estimated))
+    np.testing.assert_allclose(empty[..., :2], np.tile(said[..., :2], (3, 1, 1, 1)))
+
+
+def test_a_jam_that_comes_within_an_interval_is_not_smoothed_away():
+    """Where densities quadruple in the last third, they end at twice the minute's mean."""
+    road = {"corridor": {"fixed_sensors": []}, "loops": LOOPS | {"interval": 60}}
+    process = begun(estimator=Remembering, privacy="printed", **road)
+    first = {"traffic_seed": 0, "start": 0}
+    process.reset(ALL, [np.random.default_rng(seed) for seed in SEEDS], first)
+    nothing = np.zeros((4, 6), dtype=np.int8)
+    for second in range(60):
+        if second == 40:
+            process.estimator.held[:, :, 0] = 200.0
+        process.step(ALL, nothing)
+    beside = process.loops.segments
+    read = process.loops.said_until(process.traffic_index, process.time)[..., 0]
+    last, known = process.estimate.density[:, beside], np.isfinite(read)
+    assert (last[known] > 1.8 * read[known]).all()
 
 
 def test_readings_come_at_the_ends_of_intervals_alone():
@@ -158,10 +200,10 @@ def test_a_filter_that_starts_over_in_a_rewind_says_so():
     process = begun(privacy="printed")
     actions, added = sampled(process, T), process.loops.added
 
-    def spoilt(measured, said, seconds):
-        values = added(measured, said, seconds).values.copy()
+    def spoilt(measured, told, seconds):
+        values = added(measured, told, seconds).values.copy()
         values[5] = np.nan  # in the second that is told of
-        return added(measured, said, seconds)._replace(values=values)
+        return added(measured, told, seconds)._replace(values=values)
 
     process.loops.added = spoilt
     for action in actions[:-1]:
@@ -309,7 +351,8 @@ def test_one_state_is_kept_for_an_interval_and_little_more(preset):
     config = resolve(preset, {"traffic_seeds": [0], "loops": loops, "estimator": "ekf"})
     process = QueryProcess(config, 4)
     (log,) = process.rewind._log.parts
-    kept = bytes_of(process.rewind._kept) + bytes_of(log)
+    rewind = process.rewind
+    kept = bytes_of(rewind._kept) + bytes_of(log) + bytes_of([rewind._estimated])
     assert kept < 2 * bytes_of(process.estimator.memory)
 
 
