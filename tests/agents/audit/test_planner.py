@@ -130,7 +130,7 @@ def test_a_lone_vehicle_is_the_worst_case_of_add_remove(record):
     setting = paced(adjacency="add_remove")
     worlds = Planner(setting).choose(record, "worst-case")
     assert [len(path.step) for path in worlds.pair] == [HORIZON, 0]
-    assert 0.95 < reached(setting, worlds) <= 1.0
+    assert 0.94 < reached(setting, worlds) <= 1.0
 
 
 PACED = [
@@ -179,7 +179,7 @@ def test_no_target_exceeds_mu(kind, setting, record):
         assert len({int(step) for path in worlds.pair for step in path.step}) == 1
 
 
-@pytest.mark.parametrize("setting", [config(preset="corrected"), config(cap=2), paced()])
+@pytest.mark.parametrize("setting", [config(preset="corrected"), config(cap=2), paced(horizon=10)])
 def test_the_vehicle_that_is_deleted_tells_most(setting, record):
     chosen = reached(setting, Planner(setting).choose(record, "deleted"))
     everyone = []
