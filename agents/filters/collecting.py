@@ -132,7 +132,7 @@ def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
         sigma=_single(sigma),
         centre=_single(centre),
         inputs=_single(np.stack(recorder.inputs)),
-        told=np.stack(recorder.told),
+        told=recorder.readings(),
         truth=np.stack(recorder.truth),
     )
 
@@ -162,11 +162,18 @@ class _Recorder:
         own = measured.on_road(model.channels.size, model.n_segments)
         self.measured.append(tuple(array.copy() for array in own))
         process = self._process
-        told = np.zeros((len(episodes), model.n_segments, 6))
         if process.loops is not None:
             told = process.loops.heard(process.traffic_index[episodes], process.time[episodes])
-        self.told.append(_single(told))
+            self.told.append(_single(told))
         self._estimator.update(episodes, measured)
+
+    def readings(self) -> AnyArray:
+        """Return what readings said in all seconds; on a road without loops no memory is taken."""
+        if self.told:
+            return np.stack(self.told)
+        process, T = self._process, len(self.inputs)
+        shape = T, process.n_episodes, process.model.n_segments, 6
+        return np.broadcast_to(np.float32(0.0), shape)
 
     def __call__(self) -> None:
         """Record the prior at the reset, and the truth of every second."""
