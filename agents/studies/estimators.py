@@ -121,7 +121,7 @@ ESTIMATORS = (EKF, "ukf", "enkf", "mhe", LEARNED, SMOOTHING, WALK)
 SHARES = {f"{percent} %": percent / 100 for percent in (1, 3, 10, 30, 100)}
 BASE_SHARE = 0.1
 FIXED_SENSORS = (3, 7, 11)
-BOTH, QUERIES, PART, WHOLE = ("both", "queries", "detectors", "detectors, whole budget")
+BOTH, QUERIES, PART, WHOLE = ("both", "queries", "fixed sensors", "fixed sensors, whole budget")
 EPSILON, WHOLE_EPSILON = 5.0, 8.449590646976443
 """Epsilon of both mechanisms; the second one makes the part of fixed sensors worth `EPSILON`."""
 SENSED_SEEDS = SEEDS[:20]
@@ -136,7 +136,7 @@ def sensed(
 ) -> Labels:
     """Return the labels of an estimator with some sensors at a share of connected vehicles."""
     labels = {"release": release, "estimator": estimator, "share": share, "sensors": sensors}
-    others = {"policy": policy, "fault": "none", "detector": -1}
+    others = {"policy": policy, "fault": "none", "sensor": -1}
     return {"part": "penetration", **labels, **others}
 
 
