@@ -201,6 +201,7 @@ def make_cells(args: Args) -> tuple[str, tuple[Cell, ...]]:
     cells = []
     for estimator in dict.fromkeys(args.estimators or (str(config.estimator),)):
         own = {**given, "estimator": estimator} if args.estimators else given
+        make_config(env, own)  # warns where its settings are not of this road
         for name, policy in policies.items():
             more = {"bandwidth": config.corridor.geometry.n_mainline} if policy == ALL else {}
             cells.append(

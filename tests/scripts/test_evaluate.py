@@ -196,6 +196,13 @@ def test_estimators_come_in_the_order_of_their_errors(tmp_path):
         assert row["differences"]["error"]["mean"] == pytest.approx(less)
 
 
+def test_every_estimator_whose_settings_nobody_tuned_is_told():
+    args = Args(env=SHORT, estimators=("ekf", "blend"), policies=("round-robin",))
+    with pytest.warns(UserWarning, match="^estimator_settings: .*that nobody tuned") as told:
+        make_cells(args)
+    assert len(told) == 1
+
+
 @pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
 def test_estimators_are_judged_on_a_measured_field(tmp_path):
     tests = [each._replace(share=float(each.name == "test")) for each in SPLITS]
