@@ -286,7 +286,7 @@ class RoadEstimator:
             flow, values[1], seconds, road.lanes[segments], road.lengths[segments],
             road.limits[segments], segments >= road.n_mainline,
         )  # fmt: skip
-        found = np.where(np.isnan(flow), values, said)
+        found = np.where(np.isnan(flow), values, said[:4])
         # An interval counts once, since its errors are alike.
         weights = np.nan_to_num(1.0 / (times * found[2:] ** 2))
         return np.stack([weights, weights * np.nan_to_num(found[:2])], axis=-1).swapaxes(0, 1)

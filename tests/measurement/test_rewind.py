@@ -114,7 +114,7 @@ def test_what_is_known_of_a_segment_in_a_second_is_weighed_by_its_variance(priva
         np.testing.assert_array_equal(own[:, rest], other[:, rest])
     assert np.isfinite(said[..., 0]).all()
     assert given.observed[:, beside].all()
-    density, speed, density_std, speed_std = np.moveaxis(np.tile(said, (2, 1, 1)), -1, 0)
+    density, speed, density_std, speed_std = np.moveaxis(np.tile(told[0], (2, 1, 1)), -1, 0)
     if task.releases_flow:
         slip = speed - measured.centre[:, beside]
         least = np.maximum(density, 1.0 / process.config.corridor.road.lengths[beside])
@@ -128,15 +128,16 @@ def test_what_is_known_of_a_segment_in_a_second_is_weighed_by_its_variance(priva
 
 
 def test_a_reading_is_of_the_mean_and_leaves_an_estimate_its_course():
-    """Of three seconds of 60 in which an estimate rises, and of one episode that begins late."""
+    """Of three seconds of 30 in which an estimate rises, and of one episode that begins late."""
     loops = begun(loops=LOOPS | {"interval": 30}).loops
     n = loops.segments.size
-    said = np.tile([60.0, 40.0, 5.0, 3.0], (2, n, 1))
+    said = np.tile([60.0, 40.0, 5.0, 3.0, 2.0, 1.0], (2, n, 1))
     estimated = np.stack([[30.0, 80.0], [40.0, 60.0], [80.0, 40.0]])[:, None, None]
     estimated = np.tile(estimated, (1, 2, n, 1))
     estimated[:2, 1] = np.nan
     told = loops.told(said, estimated)
-    np.testing.assert_allclose(told[..., 2:], np.tile(said[..., 2:], (3, 1, 1, 1)))
+    std = np.hypot([5.0, 3.0], 2.0**0.5 * np.array([2.0, 1.0]))
+    np.testing.assert_allclose(told[..., 2:], np.broadcast_to(std, (3, 2, n, 2)))
     # Densities 10 below the reading in the mean are moved, speeds 20 above it scaled down.
     np.testing.assert_allclose(told[:, 0, 0, :2], [[40, 160 / 3], [50, 40], [90, 80 / 3]])
     np.testing.assert_allclose(told[2, 1, :, :2], said[1, :, :2])
