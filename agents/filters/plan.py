@@ -277,7 +277,7 @@ class FilterPlan:
         return {
             "name": name,
             "format": FORMAT,
-            "channels": [*FEATURES, *LOOP_FEATURES],
+            "channels": [*FEATURES, *(LOOP_FEATURES if ranges.loops > 0.0 else ())],
             "ranges": {key: [min(values), max(values)] for key, values in found.items() if values},
             "training": {
                 "plan": self.settings(),

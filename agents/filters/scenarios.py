@@ -131,7 +131,8 @@ class ScenarioRanges:
         sections: Share of the scenarios that are on sections of highways, not in one of `envs`.
         highways: Numbers (first, stop) of these highways; see `numbers_of`.
         free: Share of the sections that are on highways of other kinds than ``queues``.
-        loops: Share of the scenarios with loop detectors.
+        loops: Share of the scenarios with loop detectors; without any, networks do not hear of them
+            and are rewound for their readings.
         connected: Share of those where not all vehicles are connected.
         schedules: Query schedules.
         spans: Spans of queries under ``paced``.

@@ -100,7 +100,7 @@ class FilterTraining(TrainingFolder):
         super().__init__(folder, plan.settings())
         self.plan, self._records, self._executor = plan, records, executor
         torch.manual_seed(plan.seed)
-        self.network = RecurrentNetwork(plan.width)
+        self.network = RecurrentNetwork(plan.width, plan.ranges.loops > 0.0)
         if plan.initial is not None:
             self.network.take(read_weights(plan.initial).weights)
         self._optimiser = torch.optim.Adam(self.network.parameters(), plan.learning_rate)

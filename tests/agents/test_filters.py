@@ -434,6 +434,7 @@ def test_a_training_may_begin_with_other_weights_and_says_so_on_the_card(tmp_pat
     path = tmp_path / "a" / "weights.safetensors"
     first = FilterTraining(dataclasses.replace(PLAN, rounds=(Round("ekf", 1, 1),)), path.parent)
     first.run()
+    assert not read_weights(str(path)).weights.hears_loops  # RANGES have none
     ranges = read_weights(str(path)).card["ranges"]
     assert ranges["span"] == [1.0, 2.0]
     assert ranges["flows"] == [1.0, 1.0]
