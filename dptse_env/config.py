@@ -106,6 +106,7 @@ class EnvConfig:
             releases sums.
         bandwidth_unit: Cost of a query: ``segments``, the number of segments that it covers, or
             ``sums``, one.
+        query_every: Seconds of a step: one with queries, then seconds without.
         action: The action encoding: ``mask``, ``scores``, ``slots``, ``sequential``, a registered
             name, ``"package.module:Class"``, or a class.
         observation: Blocks of the observation, in order: names, ``"package.module:Class"``, classes
@@ -136,6 +137,7 @@ class EnvConfig:
     bandwidth: Annotated[int, Interval(1, 1000)] = 5
     query_spans: tuple[Annotated[int, Interval(1, 1000)], ...] = (1,)
     bandwidth_unit: BandwidthUnit = "segments"
+    query_every: Annotated[int, Interval(1, 3600)] = 1
     action: Any = "mask"
     observation: tuple[Any, ...] = (DEFAULT,)
     privacy: PrivacySettings = field(default=PrivacySettings())
@@ -468,6 +470,14 @@ def _horizon(
     return found
 
 
+def _query_every(path: str, value: Any, base: Any, corridor: Corridor, horizon: int | None) -> int:
+    """Return the seconds of a step, at most those of an episode."""
+    found: int = _typed(path, value, base)
+    most = corridor.conditions.duration if horizon is None else horizon
+    require(found <= most, path, f"at most the {most} s of an episode", found)
+    return found
+
+
 def _seeds(path: str, value: Any, base: Any, corridor: Corridor) -> tuple[int, ...]:
     """Return distinct traffic seeds, a sequence or ``"first:stop"``, as far as recorded."""
     seeds: tuple[int, ...] = _typed(
@@ -546,6 +556,7 @@ KEYWORDS = {
     "reward": Keyword(partial(_part, REWARDS)),
     "random_start": Keyword(),
     "horizon": Keyword(_horizon, ("corridor", "random_start")),
+    "query_every": Keyword(_query_every, ("corridor", "horizon")),
     "traffic_seeds": Keyword(_seeds, ("corridor",), default=_recorded_seeds),
     "truth_in_info": Keyword(),
 }

@@ -18,15 +18,16 @@ _ONLY = np.zeros(1, dtype=np.int64)
 
 
 class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
-    """Choose which segments' connected vehicles to query, second by second.
+    """Choose which segments' connected vehicles to query, step by step.
 
     Traffic flows along a motorway of n mainline segments with on- and off-ramps, S segments in all.
-    A step is one second. A policy picks a few mainline segments; the connected vehicles there are
-    queried, and a private release model answers for them and for the F fixed sensors with noisy
-    numbers. An estimator, by default an extended Kalman filter on a macroscopic traffic model,
-    updates its estimate of density and speed on all segments. The aim is to keep the error of that
-    estimate small with few queries. Queries never change the traffic: an episode replays a record
-    of SUMO, made once for each traffic seed and cached on disk.
+    A step is one second, or ``query_every`` seconds with queries in the first. A policy picks a few
+    mainline segments; the connected vehicles there are queried, and a private release model answers
+    for them and for the F fixed sensors with noisy numbers. An estimator, by default an extended
+    Kalman filter on a macroscopic traffic model, updates its estimate of density and speed on all
+    segments. The aim is to keep the error of that estimate small with few queries. Queries never
+    change the traffic: an episode replays a record of SUMO, made once for each traffic seed and
+    cached on disk.
 
     **Queries**: by default a query is one mainline segment, so that there are G = n queries, and
     a step may query as many as the ``bandwidth``. With ``query_spans`` a query is the average
@@ -88,14 +89,15 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
 
     **Reward**: minus the root mean squared error over the mainline, at most 0: of densities and
     speeds together, each in units of its scale (``joint``), or of one of them (``density``,
-    ``speed``), or a function of your own. A segment without a vehicle has no speed to err in.
+    ``speed``), or a function of your own. A segment without a vehicle has no speed to err in. The
+    reward of a step of several seconds is their mean, so that errors compare.
 
     **Start of an episode**: a traffic seed is drawn from ``traffic_seeds``, and with
     ``random_start`` the first second. The estimator starts from the traffic of the nominal demand.
     The options of `reset` fix ``traffic_seed`` (one of ``traffic_seeds``) and ``start`` [s].
 
     **End of an episode**: truncated after ``horizon`` seconds, by default with the record; never
-    terminated.
+    terminated. The last step has the seconds that are left.
 
     **Info**: the same keys at the reset and at every step; numbers are floats, but for the seed.
 
@@ -145,6 +147,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `fusion`             | {}              | how queries and sensors are put together            |
     | `reward`             | "joint"         | see above                                           |
     | `horizon`            | None            | length of an episode [s]; None for the record's     |
+    | `query_every`        | 1               | seconds of a step; its first one has queries        |
     | `random_start`       | False           | whether episodes start anywhere in their record     |
     | `traffic_seeds`      | "0:64"          | traffic to draw from                                |
     | `truth_in_info`      | False           | whether `info` shows the true traffic               |
@@ -224,6 +227,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
             is_shown = render_mode == "human"
             screen = Screen("dptse-env", self.metadata["render_fps"]) if is_shown else None
             self.drawing = Drawing(every=self.render_every, screen=screen)
+            self.process.watchers.append(self.drawing.follow)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -245,7 +249,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
         return outcome.observation[0], {**self.process.info(0), **self.process.reset_info()}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Query, estimate and score one second.
+        """Query, estimate and score a step.
 
         Raises:
             ValueError: The action has a wrong shape, dtype or value.
@@ -255,8 +259,6 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
         if process.over[0]:
             raise gym.error.ResetNeeded("the episode is over: call reset() before step()")
         outcome = process.step(_ONLY, np.asarray(action)[None])
-        if self.drawing is not None:
-            self.drawing.follow(process)
         reward, truncated = outcome.reward.item(), outcome.truncated.item()
         return outcome.observation[0], reward, False, truncated, process.info(0)
 

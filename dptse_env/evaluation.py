@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode
 from dptse_env.env import SensorQueryEnv
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
+from dptse_env.utils.arrays import IntArray
 from dptse_env.utils.validation import require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
@@ -92,7 +93,7 @@ def evaluate(
         - ``traffic_seed``: the traffic;
         - ``rmse_density``: density error, pooled over mainline segments and seconds [veh/km];
         - ``rmse_speed``: speed error, pooled over occupied mainline segments and seconds [km/h];
-        - ``reward``: mean reward of a second;
+        - ``reward``: mean reward of a second, those of a step being alike;
         - ``n_dropped``: requests that could not be served;
         - ``n_diverged``: seconds in which the estimator diverged and was started anew;
         - ``n_fallback``: seconds in which its update had no solution, so that it only predicted;
@@ -210,18 +211,27 @@ def _play(
     state: Any = None
     episode_start = np.ones(n, dtype=bool)
     seconds: list[dict[str, Any]] = []
+
+    def watch(process: QueryProcess, _: IntArray) -> None:
+        info = process.infos(np.arange(n))
+        seconds.append({key: info[key] for key in _SERIES} | {"time": process.elapsed})
+        _look(watchers)
+
     _look(watchers)
-    while not process.over.all():
-        action, state = policy.predict(observation, state, episode_start, deterministic)
-        episode_start = np.zeros(n, dtype=bool)
-        before = process.time.copy()
-        observation, reward = batch.step(action)
-        # Sequential actions may leave the traffic where it is, in all episodes or in none.
-        if (process.time > before).all():
-            info = process.infos(np.arange(n))
-            series = {key: info[key] for key in _SERIES}
-            seconds.append({"reward": np.ravel(reward), "time": process.elapsed, **series})
-            _look(watchers)
+    process.watchers.append(watch)
+    try:
+        while not process.over.all():
+            action, state = policy.predict(observation, state, episode_start, deterministic)
+            episode_start = np.zeros(n, dtype=bool)
+            n_before = len(seconds)
+            observation, reward = batch.step(action)
+            # Sequential actions may leave the traffic where it is, in all episodes or in none.
+            for k, second in enumerate(seconds[n_before:]):
+                second["reward"] = np.ravel(reward)
+                if k > 0:
+                    second["n_dropped"] = np.zeros(n)
+    finally:
+        process.watchers.remove(watch)
     return seconds
 
 

@@ -111,6 +111,7 @@ def make_task(config: EnvConfig, n_episodes: int = 1) -> Task:
         centre=model.centre(config.corridor, privacy),
         has_prices=model.has_prices,
         n_episodes=n_episodes,
+        query_every=config.query_every,
         groups=make_groups(
             config.penetration,
             config.sensor_settings,

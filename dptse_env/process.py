@@ -51,7 +51,8 @@ class Outcome:
 
     Attributes:
         observation: Shape (k, size).
-        reward: Shape (k,); zero while a sequential decision is not complete.
+        reward: Mean over the seconds of the step, shape (k,); zero while a sequential decision is
+            not complete.
         truncated: Whether the horizon is reached, shape (k,).
     """
 
@@ -84,7 +85,9 @@ class QueryProcess:
         time: Second of the record that each episode stands at, shape (n,).
         start: Second that it began at, below 0 before its first reset, shape (n,).
         traffic_index: Index into ``config.traffic_seeds`` of each episode's traffic, shape (n,).
-        queried: The queries of each episode's last query, shape (n, G).
+        queried: The queries of each episode's last decision, shape (n, G); what watchers see in a
+            second are those of the second.
+        watchers: Called after every second with the process and the episodes that moved, (k,).
         age: Steps since each mainline segment was last observed, shape (n, n_mainline).
         released: The last releases of the M channels, shape (n, M, 2).
         pending: State of the action encoding between actions.
@@ -157,6 +160,7 @@ class QueryProcess:
         self.released = np.zeros((n, self.model.channels.size, 2))
         self.estimate = self.estimator.estimate()
         self.error = EstimationError(np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64))
+        self.watchers: list[Callable[[QueryProcess, IntArray], None]] = []
         self._is_fork = False
 
     def fork(self) -> QueryProcess:
@@ -174,10 +178,10 @@ class QueryProcess:
             raise RuntimeError("a process whose privacy.noise is 'secure' has no forks")
         shared = (
             self.config, self.interface, self.model, self.traffic, self.loops, self._threads,
-            self.release.task, *self.boundary.shared,
+            self.release.task, self.watchers, *self.boundary.shared,
         )  # fmt: skip
         fork = copy.deepcopy(self, {id(item): item for item in shared})
-        fork._is_fork = True
+        fork._is_fork, fork.watchers = True, []
         return fork
 
     def reset(
@@ -245,16 +249,45 @@ class QueryProcess:
         self.n_dropped[episodes] = decision.n_dropped
         ready, n_ready = decision.complete, np.count_nonzero(decision.complete)
         if n_ready == len(episodes):
-            self._advance(episodes, decision.queried)
-            estimate = self._estimated(episodes)
-            reward = self._score(episodes, estimate)
-            return Outcome(self._observed(episodes, estimate), reward, self.over[episodes])
+            reward = self._query(episodes, decision.queried)
+            return Outcome(self.observe(episodes), reward, self.over[episodes])
         reward = np.zeros(len(episodes))
         if n_ready > 0:
-            acting = episodes[ready]
-            self._advance(acting, decision.queried[ready])
-            reward[ready] = self._score(acting, self._estimated(acting))
+            reward[ready] = self._query(episodes[ready], decision.queried[ready])
         return Outcome(self.observe(episodes), reward, self.over[episodes])
+
+    def _query(self, episodes: IntArray, queried: BoolArray) -> FloatArray:
+        """Query, and let the other seconds of the step pass; return mean rewards, shape (k,).
+
+        The last step of an episode has the seconds that are left.
+        """
+        reward = self._second(episodes, queried)
+        if self.config.query_every == 1:
+            return reward
+        told, seconds = self.estimator.innovations[episodes], np.ones(len(episodes))
+        nobody = np.zeros_like(queried)
+        for _ in range(1, self.config.query_every):
+            live = np.flatnonzero(~self.over[episodes])
+            if live.size == 0:
+                break
+            reward[live] += self._second(episodes[live], nobody[live])
+            seconds[live] += 1.0
+        # What answers told is shown until the next decision; fixed sensors have told more since.
+        answered = self.release.task.observed(queried) & ~self.release.task.observed(nobody)
+        answered = answered[:, : told.shape[1], None]
+        self.estimator.innovations[episodes] = np.where(
+            answered, told, self.estimator.innovations[episodes]
+        )
+        self.queried[episodes] = queried
+        return reward / seconds
+
+    def _second(self, episodes: IntArray, queried: BoolArray) -> FloatArray:
+        """Advance and score one second; return the rewards, shape (k,)."""
+        self._advance(episodes, queried)
+        reward = self._score(episodes, self._estimated(episodes))
+        for watcher in self.watchers:
+            watcher(self, episodes)
+        return reward
 
     @property
     def elapsed(self) -> IntArray:

@@ -65,10 +65,10 @@ class History:
         known = config.estimator
         estimator = known if isinstance(known, str) else getattr(known, "__name__", "your own")
         is_sums = config.bandwidth_unit == "sums"
+        every = config.query_every
+        often = "a second" if every == 1 else f"in {every} s"
         unit = "sums" if is_sums else f"of {len(lengths)} segments"
-        title = (
-            f"{corridor.name}, estimator {estimator}, queries {config.bandwidth} {unit} a second"
-        )
+        title = f"{corridor.name}, estimator {estimator}, queries {config.bandwidth} {unit} {often}"
         scale = corridor.scales.density_scale
         loops = tuple(corridor.stations.positions.tolist())
         return cls(episode, config.horizon_steps, lengths, scale, title=title, loops=loops)
@@ -252,8 +252,10 @@ class Drawing:
             self.screen.reopen()
             self.screen.show(self.draw())
 
-    def follow(self, process: QueryProcess) -> None:
-        """Add the second that the episode stands at."""
+    def follow(self, process: QueryProcess, episodes: IntArray) -> None:
+        """Add the second that the episode stands at, if it is one of those that moved."""
+        if self.episode not in episodes:
+            return
         assert self.history is not None
         self.history.append(process)
         if self.screen is not None:

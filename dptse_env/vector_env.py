@@ -124,6 +124,7 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         self.render_episode = integer("render_episode", render_episode, 0, self.num_envs - 1)
         if render_mode is not None:
             self.drawing = Drawing(self.render_episode)
+            self.process.watchers.append(self.drawing.follow)
         self.autoreset_mode = _mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_action_space = self.interface.actions.space
@@ -178,7 +179,7 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
     def step(
         self, actions: Action
     ) -> tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Query, estimate and score one second in every episode.
+        """Query, estimate and score a step in every episode.
 
         Raises:
             ValueError: The actions have a wrong shape, dtype or value; nothing is changed then.
@@ -219,8 +220,6 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
             outcome = self.process.step(live, actions[live])
             self._observation[live] = outcome.observation
             reward[live], truncated[live] = outcome.reward, outcome.truncated
-            if self.drawing is not None and not over[self.render_episode]:
-                self.drawing.follow(self.process)
         to_reset, final = over, None
         if self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
             to_reset, done = truncated, np.flatnonzero(truncated)

@@ -212,3 +212,81 @@ def test_an_update_that_is_not_solved_is_said_of_its_episode(monkeypatch):
     monkeypatch.undo()
     process.step(ALL[:1], nobody[:1])
     assert process.info(0)["fallback"] == 0.0
+
+
+# --- steps of several seconds ---------------------------------------------------------------------
+
+
+def seconds_of(process, action):
+    """Step, and return the error, queries and time of every second that it took."""
+    seen = []
+
+    def watch(process, episodes):
+        error = process.error
+        seen.append([error.density, error.speed, process.queried, process.time])
+        seen[-1] = [each[episodes].copy() for each in seen[-1]]
+
+    process.watchers.append(watch)
+    outcome = process.step(ALL, action)
+    process.watchers.remove(watch)
+    return outcome, seen
+
+
+@pytest.mark.parametrize("privacy", ["printed", COUNTED])
+def test_a_step_of_several_seconds_is_as_many_steps_without_a_query(privacy):
+    keywords = {"privacy": privacy, "horizon": 18, "bandwidth": 2}
+    long, short = begun(3, query_every=5, **keywords), begun(3, **keywords)
+    actions, n_seconds = sampled(long, 4), [5, 5, 5, 3]
+    for action, n in zip(actions, n_seconds, strict=True):
+        found, seen = seconds_of(long, action)
+        nobody, rewards, told = np.zeros_like(action), [], None
+        for k in range(n):
+            outcome, ((density, speed, queried, time),) = seconds_of(short, nobody if k else action)
+            np.testing.assert_equal(seen[k], [density, speed, queried, time])
+            rewards.append(outcome.reward)
+            if told is None:
+                told, asked = short.estimator.innovations.copy(), short.queried.copy()
+        np.testing.assert_array_equal(found.reward, sum(rewards) / n)
+        np.testing.assert_array_equal(found.truncated, outcome.truncated)
+        # The decision, and what its answers told, are still shown.
+        np.testing.assert_array_equal(long.queried, asked)
+        last = short.estimator.innovations[:, :6]
+        answers = np.where(asked[..., None], told[:, :6], last)
+        answers[:, 5] = last[:, 5]  # a fixed sensor tells every second
+        np.testing.assert_array_equal(long.estimator.innovations[:, :6], answers)
+        block = long.interface.observations.block(found.observation, "queried")
+        np.testing.assert_array_equal(block > 0.0, asked)
+    assert found.truncated.all()
+
+
+def test_picks_of_a_decision_take_no_time_and_the_decision_takes_all():
+    process = begun(3, action="sequential", bandwidth=2, query_every=4)
+    assert process.step(ALL, np.array([0, 1, 2])).reward.tolist() == [0.0] * 3
+    assert process.elapsed.tolist() == [0] * 3
+    assert (process.step(ALL, np.array([3, 4, 5])).reward < 0.0).all()
+    assert process.elapsed.tolist() == [4] * 3
+    fork = process.fork()
+    for each in (process, fork):
+        each.step(ALL, np.array([1, 1, 1]))
+        each.step(ALL, np.array([3, 3, 3]))
+    np.testing.assert_equal(process.infos(ALL), fork.infos(ALL))
+    assert fork.watchers == []
+
+
+def test_budgets_are_paced_for_queries_in_some_seconds():
+    often, seldom = (make(1, privacy=PAID, query_every=every) for every in (1, 5))
+    assert 1.0 < often.expected_sigma[0] / seldom.expected_sigma[0] < 5.0**0.5
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"query_every": 0}, r"query_every must be an integer in 1\.\.3600, got 0$"),
+        ({"query_every": 1.5}, r"query_every must be an integer in 1\.\.3600, got 1\.5$"),
+        ({"query_every": "two"}, r"query_every must be an integer in 1\.\.3600, got 'two'$"),
+        ({"query_every": 61}, r"query_every must be at most the 60 s of an episode, got 61$"),
+    ],
+)
+def test_bad_seconds_of_a_step_are_refused(keywords, message):
+    with pytest.raises(ValueError, match=message):
+        make(1, **keywords)

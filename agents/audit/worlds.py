@@ -139,8 +139,11 @@ class AuditedPenetration(Penetration):
 
 
 def audited(config: EnvConfig, worlds: Worlds) -> EnvConfig:
-    """Return a configuration with the worlds for traffic, whose added vehicles are connected."""
-    config = replace(config, traffic_seeds=tuple(range(len(worlds.pairs))))
+    """Return a configuration with the worlds for traffic, whose added vehicles are connected.
+
+    An adversary may query in every second, which reveals no less.
+    """
+    config = replace(config, traffic_seeds=tuple(range(len(worlds.pairs))), query_every=1)
     if config.penetration.is_complete:
         return config
     given = {each.name: getattr(config.penetration, each.name) for each in fields(Penetration)}

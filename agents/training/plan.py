@@ -190,6 +190,7 @@ def _check(algorithm: Algorithm, config: EnvConfig) -> None:
         require(model.takes_noise, "privacy.preset", f"one whose noise can be set {where}", name)
         require(queries.most_queries < n, "bandwidth", f"below {n} {where}", queries.bandwidth)
         require(horizon >= least, "horizon", f"{least} s or more {where}", horizon)
+        require(config.query_every == 1, "query_every", f"1 {where}", config.query_every)
 
 
 def make_policies(algorithm: PlackettLuceSettings, worlds: Sequence[World]) -> list[RoadPolicy]:

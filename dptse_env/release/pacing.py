@@ -105,7 +105,7 @@ class TripPacing(Pacing):
         self._first_rates = np.zeros((len(task.groups), task.n_cells))
         self._first_rates[task.channels.group[task.always], task.channels.first[task.always]] = 1.0
         mainline = self._first_rates[0, : task.corridor.geometry.n_mainline]
-        mainline[:] = np.maximum(mainline, _coverage(task.queries))
+        mainline[:] = np.maximum(mainline, _coverage(task.queries) / task.query_every)
         self._paces = Paces(
             budget=budget,
             ratio=task.settings.ratio,
@@ -144,7 +144,7 @@ class TripPacing(Pacing):
 
 
 def _coverage(queries: Queries) -> float:
-    """Return the share of the mainline that a step's queries cover if all queries are alike."""
+    """Return the share of the mainline that a decision covers if all queries are alike."""
     if queries.n_queries == 0:
         return 0.0
     bought = queries.bandwidth * float(np.mean(queries.span / queries.cost))

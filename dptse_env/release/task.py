@@ -46,13 +46,14 @@ class Task:
         settings: Its settings, of its ``settings_type``.
         corridor: The road, with the scales of densities and speeds.
         queries: The queries to choose from, the first G channels, and their bandwidth.
-        horizon: Steps of an episode.
+        horizon: Seconds of an episode.
         centre: Speed v_0 [km/h] that released flows are centred on; None where mean speeds
             are released.
         has_prices: Whether queries have prices.
         n_episodes: Size n of the batch.
         groups: Groups of channels, one or two. All channels are one group, or the queries are
             the first and all others the second.
+        query_every: Seconds from one decision on queries to the next.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Task:
     has_prices: bool = False
     n_episodes: int = 1
     groups: tuple[Group, ...] = (Group("queries"),)
+    query_every: int = 1
 
     @property
     def is_whole(self) -> bool:

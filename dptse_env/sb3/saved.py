@@ -235,6 +235,8 @@ def _fit(config: EnvConfig, name: str) -> dict[str, Any]:
     }
     if config.corridor.loops is not None:
         fit["loops"] = config.corridor.loops.fields()
+    if config.query_every > 1:
+        fit["query_every"] = config.query_every
     if not config.queries.are_segments:
         fit["queries"] = f"{config.queries}, bandwidth_unit {config.bandwidth_unit!r}"
     if name == SHARED:
@@ -251,6 +253,7 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
     there, here = card["fits"], _fit(config, card["policy"]["class"])
     pairs = {key: (there.get(key), here[key]) for key in ("format", "action", "bandwidth")}
     pairs["queries"] = there.get("queries", _PLAIN), here.get("queries", _PLAIN)
+    pairs["query_every"] = there.get("query_every", 1), config.query_every
     road_there, road_here = there["corridor"], here["corridor"]
     observations = there.get("observation"), here["observation"]
     if "channels" in here:

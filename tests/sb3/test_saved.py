@@ -198,6 +198,7 @@ def test_the_card_describes_the_policy(stored):
             "with action='slots'$",
         ),
         ({"bandwidth": 3}, r"bandwidth is 2 for the policy and 3 for the environment"),
+        ({"query_every": 4}, r"query_every is 1 for the policy and 4 for the environment"),
         (
             {"incident": "none"},
             r"corridor is 'short-highway \(6 .*\), traffic (\w{8})' for the policy and "
