@@ -112,7 +112,7 @@ def test_queries_count_connected_vehicles_and_sensors_all_in_columns_of_their_ow
     assert task.channels.first.tolist() == [*range(8), 3, 5]
     assert task.sensors.tolist() == [8, 9, 7]
     assert task.channels.group.tolist() == [0] * N + [1] * 4
-    for released, asked, _ in play(process, 20):
+    for released, asked, _ in play(process, 12):
         assert np.flatnonzero(asked.observed[0]).tolist() == [0, 3, *COLUMNS]
         every, some = true_counts(process, asked, 0, 3, 7, 3, 5)
         expected = np.append(some[:2], every[2:])
