@@ -15,6 +15,7 @@ from typing import Any
 
 from dptse_env.estimators.settings import PATH, EstimatorSettings
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
+from dptse_env.utils.registry import require_registered
 from dptse_env.utils.validation import check_object, cut, from_mapping, read_json, shown, within
 
 _KEYS = {"estimator": str, "settings": dict, "provenance": dict}
@@ -118,8 +119,8 @@ def read_settings(path: str | Path) -> EstimatorSettings:
     """Read tuned settings from a JSON file, as written by `write_settings`.
 
     Raises:
-        ValueError: The file cannot be read, has another format, or a setting is out of range; the
-            message starts with the path of the file.
+        ValueError: The file cannot be read, has another format, a setting is out of range, or an
+            expert is named by an import string; the message starts with the path of the file.
     """
     return _parse(_entry(read_json(path), str(path)), str(path))
 
@@ -175,4 +176,6 @@ def _entry(content: Any, path: str) -> dict[str, Any]:
 
 def _parse(entry: Mapping[str, Any], path: str) -> EstimatorSettings:
     with within(f"{path}: "):
-        return from_mapping(EstimatorSettings, entry["settings"], PATH)
+        found = from_mapping(EstimatorSettings, entry["settings"], PATH)
+        require_registered(list(found.mixture.experts or ()), f"{PATH}.mixture.experts")
+    return found

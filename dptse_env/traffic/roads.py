@@ -169,6 +169,10 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
         try:
             for key in PARTS:
                 require_registered(environment.get(key), f"{_ENVIRONMENT}.{key}")
+            settings = environment.get("estimator_settings")
+            mixture = settings.get("mixture") if isinstance(settings, Mapping) else None
+            experts = mixture.get("experts") if isinstance(mixture, Mapping) else None
+            require_registered(experts, f"{_ENVIRONMENT}.estimator_settings.mixture.experts")
             home = path.resolve().parent
             keywords = {key: _absolute(value, home) for key, value in environment.items()}
         except RecursionError as problem:

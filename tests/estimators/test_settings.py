@@ -102,6 +102,10 @@ def test_a_written_set_reads_back_over_the_defaults(tmp_path):
     [
         ({"process_noise": [-1.0, 0.1]}, r"process_noise\[0\] must be a number in "),
         ({"mhe": {"horizons": 3}}, r"mhe\.horizons is unknown; allowed: "),
+        (
+            {"mixture": {"experts": ["ekf", "own:Part"]}},
+            r"mixture\.experts\[1\] must be a registered name \(",
+        ),
     ],
 )
 def test_bad_settings_are_neither_written_nor_read(settings, message, tmp_path):

@@ -108,6 +108,11 @@ def test_bad_files_are_refused_by_file_and_field(road, old, new, message):
         ("observation", '["default", "own:Part"]', r"\[1\]"),
         ("privacy", '{ preset = "own:Part" }', r"\.preset"),
         ("reward", '"own:Part"', ""),
+        (
+            "estimator_settings",
+            '{ mixture = { experts = ["ekf", "own:Part"] } }\nestimator = "mixture"',
+            r"\.mixture\.experts\[1\]",
+        ),
     ],
 )
 def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
