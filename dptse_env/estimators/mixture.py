@@ -8,11 +8,11 @@ import numpy as np
 
 from dptse_env.estimators.base import Estimate, Estimator, Measurement, Played
 from dptse_env.estimators.recurrent import SHIPPED, Recurrent, weights_for
-from dptse_env.estimators.settings import EstimatorSettings, RecurrentSettings
+from dptse_env.estimators.settings import PATH, EstimatorSettings, RecurrentSettings
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
 from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
-from dptse_env.utils.validation import within
+from dptse_env.utils.validation import require, within
 
 LEAST_VARIANCE = 1e-12
 
@@ -56,7 +56,7 @@ class Mixture(Estimator):
         from dptse_env.estimators import check_settings  # noqa: PLC0415 (which names this module)
 
         for kind, own in _experts(settings, model.road, model.releases_flow):
-            with within("estimator_settings.mixture.experts: "):
+            with within(f"{PATH}.mixture.experts: "):
                 check_settings(kind, model, own)
 
     @classmethod
@@ -155,14 +155,18 @@ def _experts(
     """Return the classes and settings of the experts; other names are those of weights.
 
     Raises:
-        ValueError: An estimator cannot be found.
+        ValueError: An estimator cannot be found, or is a mixture.
     """
     from dptse_env.estimators import ESTIMATORS  # noqa: PLC0415 (which names this module)
 
     found: list[tuple[type[Estimator], EstimatorSettings]] = []
     for name in settings.mixture.experts or _weights_on(road, flows):
         if name in ESTIMATORS or ":" in name:
-            found.append((ESTIMATORS.find(name), settings))
+            with within(f"{PATH}.mixture.experts: "):
+                kind = ESTIMATORS.find(name)
+            other = not issubclass(kind, Mixture)
+            require(other, f"{PATH}.mixture.experts", "other estimators than a mixture", name)
+            found.append((kind, settings))
         else:
             own = dataclasses.replace(settings, recurrent=RecurrentSettings(name))
             found.append((Recurrent, own))

@@ -83,6 +83,20 @@ def test_experts_are_two_or_more_others(experts, message):
         mixing(*experts)
 
 
+@pytest.mark.parametrize(
+    ("expert", "message"),
+    [
+        ("dptse_env.estimators.mixture:Mixture", " must be other estimators than a mixture, got "),
+        ("no_such:Part", ": estimator 'no_such:Part' cannot be imported: "),
+    ],
+)
+def test_an_expert_that_cannot_be_is_refused_by_its_place(expert, message):
+    with pytest.raises(ValueError, match=rf"^estimator_settings\.mixture\.experts{message}"):
+        make_estimator(
+            "mixture", "compiled", model_of("published", "speed"), 1, mixing("ekf", expert)
+        )
+
+
 def test_an_expert_is_an_estimator_or_the_name_of_weights():
     model = model_of("published", "speed")
     mixture = make_estimator("mixture", "compiled", model, 1, EstimatorSettings())
