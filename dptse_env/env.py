@@ -109,8 +109,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | ``traffic_seed``    | seed of the record that is replayed, an integer; true traffic     |
     | ``n_dropped``       | requested queries that were cut, repeated or replaced             |
     | ``queried``         | the queries that were made, flags of shape (G,)                   |
-    | ``diverged``        | 1 if the estimator diverged in this second and was started anew   |
-    | ``fallback``        | 1 if its update had no solution in this second: it only predicted |
+    | ``diverged``        | 1 if the estimator diverged in this step and was started anew     |
+    | ``fallback``        | 1 if its update had no solution in this step: it only predicted   |
     | ``spent_mu``        | privacy loss of a vehicle so far, at most: Gaussian DP parameter  |
     | ``spent_epsilon``   | the same as epsilon at the configured delta                       |
     | ``prices``          | under ``paced``: last price of each query, 0 before, shape (G,)   |

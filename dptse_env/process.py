@@ -264,20 +264,22 @@ class QueryProcess:
         reward = self._second(episodes, queried)
         if self.config.query_every == 1:
             return reward
-        told, seconds = self.estimator.innovations[episodes], np.ones(len(episodes))
-        nobody = np.zeros_like(queried)
+        estimator, seconds, nobody = self.estimator, np.ones(len(episodes)), np.zeros_like(queried)
+        told = estimator.innovations[episodes]
+        diverged, fallback = estimator.diverged[episodes], estimator.fallback[episodes]
         for _ in range(1, self.config.query_every):
             live = np.flatnonzero(~self.over[episodes])
             if live.size == 0:
                 break
             reward[live] += self._second(episodes[live], nobody[live])
             seconds[live] += 1.0
+            diverged |= estimator.diverged[episodes]
+            fallback |= estimator.fallback[episodes]
         # What answers told is shown until the next decision; fixed sensors have told more since.
         answered = self.release.task.observed(queried) & ~self.release.task.observed(nobody)
         answered = answered[:, : told.shape[1], None]
-        self.estimator.innovations[episodes] = np.where(
-            answered, told, self.estimator.innovations[episodes]
-        )
+        estimator.innovations[episodes] = np.where(answered, told, estimator.innovations[episodes])
+        estimator.diverged[episodes], estimator.fallback[episodes] = diverged, fallback
         self.queried[episodes] = queried
         return reward / seconds
 

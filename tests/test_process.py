@@ -273,6 +273,32 @@ def test_picks_of_a_decision_take_no_time_and_the_decision_takes_all():
     assert fork.watchers == []
 
 
+def test_a_second_without_a_solution_is_flagged_for_its_whole_step(monkeypatch):
+    process, nobody = begun(2, estimator="mhe", query_every=4), np.zeros((2, 6), dtype=np.int8)
+    for _ in range(3):
+        process.step(ALL[:2], nobody)
+    make_unsolvable(process.estimator, monkeypatch)
+    process.watchers.append(lambda *_: monkeypatch.undo())  # after the first of its seconds
+    process.step(ALL[:1], nobody[:1])
+    assert [process.info(e)["fallback"] for e in range(2)] == [1.0, 0.0]
+    process.step(ALL[:1], nobody[:1])
+    assert process.info(0)["fallback"] == 0.0
+
+
+def test_a_second_that_diverges_is_flagged_for_its_whole_step():
+    process, added = begun(1, query_every=4), []
+
+    def lost(episodes, values, *noise):
+        added.append(values)
+        return np.full_like(values, np.nan) if len(added) == 1 else values
+
+    process.release.noise.added = lost
+    process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
+    assert process.info(0)["diverged"] == 1.0
+    process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
+    assert (process.info(0)["diverged"], len(added)) == (0.0, 8)
+
+
 def test_budgets_are_paced_for_queries_in_some_seconds():
     often, seldom = (make(1, privacy=PAID, query_every=every) for every in (1, 5))
     assert 1.0 < often.expected_sigma[0] / seldom.expected_sigma[0] < 5.0**0.5
