@@ -691,7 +691,7 @@ def _inherited(
         if "parameters" not in given:
             found.append("parameters")
     is_other = is_other_road or parameters != load_parameters(tuned_with(parameters))
-    if "estimator_settings" not in given and _is_untuned(config, is_other):
+    if given.get("estimator_settings") is None and _is_untuned(config, is_other):
         found.append("estimator_settings")
     centre = config.release_model.centre(corridor, config.privacy)
     estimator: type[Estimator] = ESTIMATORS.find(config.estimator)

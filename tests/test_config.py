@@ -159,8 +159,9 @@ def test_every_shipped_combination_has_tuned_settings_or_says_that_it_has_none()
 def test_settings_that_are_given_need_no_tuned_ones():
     given = {"privacy": "printed", "estimator": "blend"}
     assert resolve("paper-highway", {**given, "estimator_settings": {}}).inherited == ()
-    with pytest.raises(UserWarning, match=r"^estimator_settings: .*defaults that nobody tuned"):
-        resolve("paper-highway", given)
+    for none in ({}, {"estimator_settings": None}):  # which are the same
+        with pytest.raises(UserWarning, match=r"^estimator_settings: .*defaults that nobody tuned"):
+            resolve("paper-highway", {**given, **none})
 
 
 PAPER_FILTERS = {
