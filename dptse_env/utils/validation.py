@@ -221,16 +221,16 @@ def _convert_union(options: tuple[Any, ...], value: Any, path: str, base: Any) -
         fits = [cls for cls in classes if set(value) <= set(field_hints(cls))]
         if classes:
             return convert((fits or classes)[0], value, path, base)
-    if not isinstance(value, Mapping):
-        # A sequence and a single value are two ways to say the same: only one of them is meant.
-        is_sequence = isinstance(value, Sequence) and not isinstance(value, str | bytes)
-        fits = [option for option in options if (_parsed(option)[2] is tuple) == is_sequence]
-        options = tuple(fits) if fits and len(fits) < len(options) else options
     if value is not None and types.NoneType in options:
         options = tuple(option for option in options if option is not types.NoneType)
         suffix = " or None"
     else:
         suffix = ""
+    if not isinstance(value, Mapping):
+        # A sequence and a single value are two ways to say the same: only one of them is meant.
+        is_sequence = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+        fits = [option for option in options if (_parsed(option)[2] is tuple) == is_sequence]
+        options = tuple(fits) if fits and len(fits) < len(options) else options
     if len(options) == 1:
         try:
             return convert(options[0], value, path, base)

@@ -47,6 +47,7 @@ FILE = {"mhe-published-corrected": ENTRY}
         ("bounds", "ball", r"bounds must be one of cone, box, got 'ball'"),
         ("mhe", {"arrival_noise": [0.1, 0.0]}, r"mhe\.arrival_noise\[1\] must be .*, got 0\.0"),
         ("enkf", {"n_member": 50}, r"enkf\.n_member is unknown; allowed: n_members"),
+        ("mixture", {"experts": "ekf"}, r"mixture\.experts must be a sequence or None, got 'ekf'$"),
     ],
 )
 def test_a_bad_setting_is_named(field, value, message):
