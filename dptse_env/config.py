@@ -696,7 +696,8 @@ def _inherited(
     centre = config.release_model.centre(corridor, config.privacy)
     estimator: type[Estimator] = ESTIMATORS.find(config.estimator)
     played = _played(config, centre is not None)
-    found += estimator.inherits(corridor.road, played, config.settings())
+    with within(config.origins.get("estimator_settings", "")):
+        found += estimator.inherits(corridor.road, played, config.settings())
     return tuple(found)
 
 

@@ -62,11 +62,13 @@ class Mixture(Estimator):
     @classmethod
     def inherits(cls, road: Road, played: Played, settings: EstimatorSettings) -> tuple[str, ...]:
         """Return the setting of the experts where no weights were trained on such roads."""
-        found = [
-            bool(kind.inherits(road, played, own))
-            for kind, own in _experts(settings, road, bool(played["flows"][0]))
-            if issubclass(kind, Recurrent)
-        ]
+        experts = _experts(settings, road, bool(played["flows"][0]))
+        with within(f"{PATH}.mixture.experts: "):
+            found = [
+                bool(kind.inherits(road, played, own))
+                for kind, own in experts
+                if issubclass(kind, Recurrent)
+            ]
         return ("estimator_settings.mixture.experts",) if found and all(found) else ()
 
     @property

@@ -146,6 +146,14 @@ def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
         ('"a\\nb" = 0', r"environment\.a\\nb is unknown"),
         ('estimator_settings = "x.json"', r"environment\.estimator_settings: .*x\.json cannot be"),
         ("bandwidth = 9", r"environment\.bandwidth must be in 1\.\.8, got 9"),
+        (
+            'estimator = "recurrent"\nestimator_settings = { recurrent = { weights = "x" } }',
+            r"environment\.estimator_settings\.recurrent\.weights must be a file or .*, got 'x'",
+        ),
+        (
+            'estimator = "mixture"\nestimator_settings = { mixture = { experts = ["ekf", "x"] } }',
+            r"environment\.estimator_settings\.mixture\.experts: .* must be a file or .*, got 'x'",
+        ),
     ],
 )
 def test_bad_keywords_of_a_file_are_refused_by_file_and_key(road, line, message):
