@@ -39,7 +39,7 @@ def test_every_study_is_found_and_a_cell_has_one_set_of_labels(name):
         ({"name": "no_such_module:STUDY"}, "'no_such_module:STUDY' cannot be imported"),
         ({"name": "examples.my_study:CELLS"}, "must be a Study, got tuple"),
         ({"name": f'{MINE} {{"minutes": 1}}'}, "keywords of the study .*:STUDY must be none"),
-        ({"name": 'roads {"minutes": 1}'}, "study roads takes weights, .*argument 'minutes'"),
+        ({"name": 'roads {"minutes": 1}'}, "study roads takes weights: .*argument 'minutes'"),
         ({"name": 'roads {"weights": 3}'}, "weights must be"),
         ({"name": 'roads {"weights": [3]}'}, "weights"),
         ({"name": 'roads {"weights"}'}, "study must be JSON"),
