@@ -89,13 +89,14 @@ def on_private_highway(rows: pl.DataFrame) -> dict[str, Interval]:
 
 
 def on_other_roads(rows: pl.DataFrame) -> dict[str, Interval]:
-    """Return errors on roads that nobody trained on, under `paced`."""
-    roads = [road for road in OWN if road in rows["road"]]
+    """Return errors on the own roads, which nobody trained on, under `paced`."""
+    played = rows.filter(pl.col("road").is_in(list(OWN)))
+    roads = [road for road in OWN if road in played["road"]]
     return {
         name: mean_interval(
-            np.mean([values(rows, on_road(road, "paced", name), ERROR) for road in roads], axis=0)
+            np.mean([values(played, on_road(road, "paced", name), ERROR) for road in roads], axis=0)
         )
-        for name in rows["estimator"].unique()
+        for name in played["estimator"].unique()
     }
 
 
