@@ -116,7 +116,7 @@ class Scenario(Cell):
 
     @property
     def is_taught(self) -> bool:
-        """Whether initial weights may know such roads and noise, and so may teach."""
+        """True where initial weights may know such roads and noise, and so may teach."""
         is_known = self.section is None and self.keywords["privacy"]["epsilon"] <= EPSILONS[1]
         has_loops = "loops" in self.keywords.get("corridor", {})
         return is_known and not has_loops and "penetration" not in self.keywords

@@ -41,7 +41,7 @@ Played = Mapping[str, Sequence[float]]
 ``headway``
     Desired time headways of drivers [s], where they are given.
 ``loop_interval``
-    Interval of loop detectors [s].
+    Interval of loops [s].
 """
 
 
@@ -279,11 +279,11 @@ class Estimator(ABC):
 
     @property
     def hears_loops(self) -> bool:
-        """Whether it takes readings of loop detectors by `hear`; they replace measurements else."""
+        """True where it takes readings of loops by `hear`; else it is rewound for them."""
         return False
 
     def hear(self, episodes: IntArray, told: FloatArray) -> None:
-        """Take what the last readings of loop detectors say, for the next update.
+        """Take what the last readings of loops say, for the next update.
 
         Args:
             episodes: Shape (k,).

@@ -98,7 +98,7 @@ class Recurrent(SegmentEstimator):
 
     @property
     def hears_loops(self) -> bool:
-        """Whether its weights have readings of loop detectors among their features."""
+        """True where its weights have readings of loops among their features."""
         return self.saved.weights.hears_loops
 
     def hear(self, episodes: IntArray, told: FloatArray) -> None:

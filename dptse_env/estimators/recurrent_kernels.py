@@ -134,7 +134,7 @@ class Weights(NamedTuple):
 
     @property
     def hears_loops(self) -> bool:
-        """Whether `LOOP_FEATURES` are among the C features."""
+        """True where `LOOP_FEATURES` are among the C features."""
         return len(self.inputs) > N_FEATURES + 2 * message_width(self.width)
 
 

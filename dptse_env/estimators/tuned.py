@@ -25,7 +25,7 @@ DEFAULT_PARAMETERS = "w99-3lane"
 those fitted to simulated traffic, which predict it about as well as others that are fitted."""
 
 PUBLISHED = "published"
-"""What stands for the settings of the paper's filters, whatever parameters and release model."""
+"""Name of the paper's filters as the paper has them, for all parameters and release models."""
 
 
 def tuned_settings(
