@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -174,9 +174,7 @@ def _draw_bottlenecks(rng: np.random.Generator, n: int) -> tuple[Incident, ...]:
     return tuple(found)
 
 
-KINDS: tuple[Kind, ...] = (
-    "queues", "lorries", "convoys", "compliance", "weaving", "autobahn",
-)  # fmt: skip
+KINDS: tuple[Kind, ...] = get_args(Kind)
 """All kinds; those after the first one are mostly free traffic."""
 
 

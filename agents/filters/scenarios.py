@@ -5,7 +5,6 @@ All scenarios of a training come from `ScenarioRanges.draw`. For other roads giv
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +18,8 @@ from agents.filters.highways import Kind as HighwayKind
 from agents.filters.sections import SEGMENTS, Section
 from agents.play import Cell
 from dptse_env.traffic import Loops
+from dptse_env.traffic.loops import borders_of
+from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.validation import Interval, checked_fields, require
 
 Kind = Literal["flows", "speeds"]
@@ -187,8 +188,7 @@ class ScenarioRanges:
             env, keywords = parse_env(str(rng.choice(self.envs)))
             corridor = make_config(env, keywords).corridor
             if rng.random() < self.loops:
-                lengths = corridor.geometry.segment_lengths[: corridor.geometry.n_mainline]
-                loops = dataclasses.asdict(_draw_loops(rng, lengths, seconds))
+                loops = _draw_loops(rng, borders_of(corridor.geometry), seconds).fields()
                 keywords["corridor"] = {**keywords.get("corridor", {}), "loops": loops}
             n_mainline = corridor.geometry.n_mainline
             drawn = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
@@ -239,8 +239,8 @@ class ScenarioRanges:
         n_sensors = int(rng.choice([0, 1, 2, 3], p=[0.6, 0.2, 0.1, 0.1]))
         sensors = rng.choice(segments, size=n_sensors, replace=False)
         has_loops = not averaged and rng.random() < self.loops
-        lengths = whole.segment_lengths[:segments]
-        loops = _draw_loops(rng, lengths, seconds) if has_loops else None
+        borders = borders_of(whole, range(segments))
+        loops = _draw_loops(rng, borders, seconds) if has_loops else None
         misjudged = float(np.exp(rng.normal(0.0, MISJUDGED))) if rng.random() < 0.5 else 1.0
         return Section(
             number,
@@ -262,9 +262,8 @@ def numbers_of(kind: HighwayKind, highways: tuple[int, int]) -> range:
     return range(first, stop if kind == "queues" else first + -(-(stop - first) // 5))
 
 
-def _draw_loops(rng: np.random.Generator, lengths: Sequence[float], seconds: int) -> Loops:
-    """Draw loops at borders between segments of some lengths, for episodes of some seconds."""
-    borders = np.round(np.concatenate([[0.0], np.cumsum(lengths)]), 6)
+def _draw_loops(rng: np.random.Generator, borders: FloatArray, seconds: int) -> Loops:
+    """Draw loops at borders of segments [km], for episodes of some seconds."""
     distance = float(np.exp(rng.uniform(*np.log(STATIONS))))
     places = np.arange(rng.uniform(0.0, min(distance, borders[-1])), borders[-1], distance)
     interval = int(rng.choice([each for each in INTERVALS if each <= seconds]))
