@@ -146,7 +146,7 @@ def test_a_reading_is_of_the_mean_and_leaves_an_estimate_its_course():
 
 
 def test_a_jam_that_comes_within_an_interval_is_not_smoothed_away():
-    """Where densities quadruple in the last third, they end at twice the minute's mean."""
+    """Densities that quadruple in the last third end at twice the minute's mean."""
     road = {"corridor": {"fixed_sensors": []}, "loops": LOOPS | {"interval": 60}}
     process = begun(estimator=Remembering, privacy="printed", **road)
     first = {"traffic_seed": 0, "start": 0}
