@@ -85,7 +85,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | ``sequential`` | ``Discrete(G)``            | one query per action, see `action_masks`     |
 
     Under ``sequential`` the traffic stands still, and the reward is 0, until the bandwidth pays for
-    no other query.
+    no other query. Every id has a variant of each encoding, as ``ShortHighway-Discrete-v0``
+    (`dptse_env.registration.ENCODINGS`).
 
     **Reward**: minus the root mean squared error over the mainline, at most 0: of densities and
     speeds together, each in units of its scale (``joint``), or of one of them (``density``,
@@ -97,7 +98,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     The options of `reset` fix ``traffic_seed`` (one of ``traffic_seeds``) and ``start`` [s].
 
     **End of an episode**: truncated after ``horizon`` seconds, by default with the record; never
-    terminated. The last step has the seconds that are left.
+    terminated. The last step has the seconds that are left. ``spec.max_episode_steps`` is the
+    number of steps, where it does not depend on the actions.
 
     **Info**: the same keys at the reset and at every step; numbers are floats, but for the seed.
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from dptse_env.config import resolve
@@ -16,6 +19,7 @@ from dptse_env.process import QueryProcess
 from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records, open_library
 from dptse_env.utils.arrays import BoolArray
+from dptse_env.utils.registry import is_foreign
 from dptse_env.utils.validation import require, within
 
 
@@ -63,10 +67,35 @@ class QueryEnvBase:
         with within(config.origins.get("estimator_settings", "")):
             check_settings(config.estimator, self._model, config.settings())
         self._library, self._threads = open_library(records), threads
+        self._spec: EnvSpec | None = None
         self._n_episodes = n_episodes
         self._process: QueryProcess | None = None
         self.drawing: Drawing | None = None
         warn_where_void(config)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What it was registered as, with its keywords.
+
+        ``max_episode_steps`` is `n_steps`. Ids are registered without it: keywords change it, and
+        a time limit of Gymnasium would cut longer episodes.
+        """
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec and replace(spec, max_episode_steps=self.n_steps)
+
+    @property
+    def n_steps(self) -> int | None:
+        """Steps of an episode; None where they depend on the actions."""
+        actions = self.interface.actions
+        varies = actions.picks_one_by_one and self.interface.queries.costs_differ
+        if varies or is_foreign(actions):
+            return None
+        return math.ceil(self.config.horizon_steps / self.config.query_every) * (
+            actions.actions_per_step
+        )
 
     @property
     def process(self) -> QueryProcess:

@@ -16,6 +16,10 @@ ENVIRONMENTS = {
 }
 """Environment ids and the preset behind each."""
 
+ENCODINGS = {"Discrete": "sequential", "Box": "scores", "Slots": "slots"}
+"""Action encodings by the suffix that an id may have before its version, for programs that take an
+id alone. An id without one has the mask, or what a road file says."""
+
 REGISTRIES = {
     "action": "dptse_env.spaces.actions:ACTION_ENCODINGS",
     "corridor": "dptse_env.traffic:CORRIDORS",
@@ -31,13 +35,23 @@ REGISTRIES = {
 def register_environments() -> None:
     """Register the ids with Gymnasium; calling it twice changes nothing."""
     for env_id, preset in ENVIRONMENTS.items():
-        if env_id not in registry:
-            register(
-                id=env_id,
-                entry_point="dptse_env.env:SensorQueryEnv",
-                vector_entry_point="dptse_env.vector_env:SensorQueryVectorEnv",
-                kwargs={"preset": preset},
-            )
+        kwargs = {env_id: {"preset": preset}}
+        for suffix, action in ENCODINGS.items():
+            kwargs[encoded(env_id, suffix)] = {"preset": preset, "action": action}
+        for own_id, own in kwargs.items():
+            if own_id not in registry:
+                register(
+                    id=own_id,
+                    entry_point="dptse_env.env:SensorQueryEnv",
+                    vector_entry_point="dptse_env.vector_env:SensorQueryVectorEnv",
+                    kwargs=own,
+                )
+
+
+def encoded(env_id: str, suffix: str) -> str:
+    """Return the id of an environment with a suffix of `ENCODINGS`."""
+    road, _, version = env_id.rpartition("-")
+    return f"{road}-{suffix}-{version}"
 
 
 def register_part(keyword: str, name: str, part: Any) -> None:

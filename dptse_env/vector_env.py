@@ -19,7 +19,7 @@ from dptse_env.process import per_episode
 from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.validation import integer, require_name
+from dptse_env.utils.validation import integer, require, require_name
 from dptse_env.utils.vector_info import Infos, in_vector_form, object_array, repeated_infos
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
@@ -93,6 +93,7 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         render_episode: int = 0,
         records: Records = None,
         threads: int | None = None,
+        max_episode_steps: int | None = None,
         **overrides: Any,
     ) -> None:
         """Describe the environment; nothing is recorded or compiled before `reset`.
@@ -107,6 +108,8 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
                 cache.
             threads: Threads of the estimator, each for a block of episodes; None for one per core.
                 Their number changes the time only.
+            max_episode_steps: Steps of an episode, as a ``spec`` names them, or None. They follow
+                from ``horizon``, ``query_every`` and ``action``.
             **overrides: As in `dptse_env.env.SensorQueryEnv`.
 
         Raises:
@@ -121,6 +124,9 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
         threads = None if threads is None else integer("threads", threads, 1, 1024)
         super().__init__(preset, overrides, self.num_envs, records, render_mode, threads=threads)
+        known = (None, self.n_steps)
+        allowed = f"{self.n_steps}, as keywords have it: horizon shortens episodes"
+        require(max_episode_steps in known, "max_episode_steps", allowed, max_episode_steps)
         self.render_episode = integer("render_episode", render_episode, 0, self.num_envs - 1)
         if render_mode is not None:
             self.drawing = Drawing(self.render_episode)
