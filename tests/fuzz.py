@@ -50,7 +50,7 @@ from dptse_env.importers.source import read_source
 from dptse_env.importers.sumo_net import import_road, read_configuration, segment_path
 from dptse_env.model import ARZParameters, load_parameters
 from dptse_env.model.parameters import write_parameters
-from dptse_env.policies import read_policy, shipped_policies
+from dptse_env.policies import TRANSFERABLE, read_policy, shipped_policies
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
@@ -241,7 +241,7 @@ def policies(rng, folder):
     def act():
         policy, card = find_policy(str(path)), read_policy(name).card
         env = gym.make(card["env"], **{**card["keywords"], **policy.keywords})
-        acting = policy.load(env, allow=("corridor", "bandwidth"))
+        acting = policy.load(env, allow=TRANSFERABLE)
         observation = np.zeros(env.observation_space.shape, np.float32)
         assert env.action_space.contains(acting.predict(observation, deterministic=True)[0])
 

@@ -14,16 +14,17 @@ from dptse_env.utils.validation import require_name
 SUFFIX = ".safetensors"
 """Ending of the names of files with weights."""
 
-TRANSFERABLE = ("corridor", "bandwidth")
-"""Properties that a caller may allow to differ between a policy and its environment."""
+TRANSFERABLE = ("corridor", "bandwidth", "privacy")
+"""Properties that a caller may allow to differ between a policy and its environment. Another
+release (``privacy``) is told of where it is not allowed, and the others are refused."""
 
 DETERMINISTIC, DRAWN = "deterministic", "drawn"
 """Modes of a policy on its card: it takes its likeliest action, or draws one."""
 
 _FOLDER = Path(__file__).parent
 _FIELDS: Mapping[str, type] = {
-    "fits": dict, "fits.action": str, "fits.corridor": str, "policy": dict, "policy.class": str,
-    "policy.arguments": dict, "acts": str, "env": str,
+    "fits": dict, "fits.action": str, "fits.corridor": str, "fits.privacy": dict,
+    "policy": dict, "policy.class": str, "policy.arguments": dict, "acts": str, "env": str,
     "keywords": dict, "trained_on": str, "training": dict,
 }  # fmt: skip
 """Fields that a card must have, with their types."""

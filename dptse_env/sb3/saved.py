@@ -6,7 +6,7 @@ import importlib
 import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
 from dptse_env.policies import DETERMINISTIC, DRAWN, SUFFIX, TRANSFERABLE, read_policy
+from dptse_env.release import RELEASE_MODELS, PrivacySettings
 from dptse_env.sb3.acting import ActingPolicy, Normalisation
 from dptse_env.sb3.road_policy import MOST_NEIGHBOURS, RoadChannels, RoadPolicy
 from dptse_env.sb3.vec_env import config_of
@@ -145,7 +146,6 @@ def save_policy(
             "keywords": dict(keywords),
             "trained_on": describe_road(config.corridor),
             "estimator": ESTIMATORS.name_of(config.estimator),
-            "epsilon": config.privacy.epsilon,
             "versions": versions_with("stable-baselines3", "torch"),
             "training": dict(training),
             "figures": dict(figures),
@@ -174,10 +174,11 @@ def load_policy(
         env: The environment in which it acts: of this package, scalar or vector, wrapped or not,
             or as an `SB3VecEnv`. Its keyword ``action`` is the policy's, ``fits.action`` of its
             card.
-        allow: Properties that may differ on purpose, of `TRANSFERABLE`. Estimator, privacy and
-            traffic model may always differ. With ``"corridor"`` a `RoadPolicy` acts on
-            roads of any size whose observations have the same channels (`RoadChannels`); a
-            perceptron's observations must have the same size.
+        allow: Properties that may differ on purpose, of `TRANSFERABLE`. Estimator and traffic model
+            may always differ. With ``"corridor"`` a `RoadPolicy` acts on roads of any size whose
+            observations have the same channels (`RoadChannels`); a perceptron's observations must
+            have the same size. Another release model is told of unless ``"privacy"`` is allowed; it
+            is refused in any case where it shows a policy other observations.
 
     Raises:
         FileNotFoundError: There is no such file, nor such a name.
@@ -185,7 +186,8 @@ def load_policy(
             message names the values of both.
 
     Warns:
-        UserWarning: It was trained at another epsilon, and ``allow`` is empty.
+        UserWarning: It was trained with another release model, epsilon, delta or other setting of
+            ``privacy``, and ``allow`` lacks ``"privacy"``.
     """
     unknown = [name for name in allow if name not in TRANSFERABLE]
     if unknown:
@@ -197,11 +199,10 @@ def load_policy(
         policy, normalisation = _made(file.card, file.weights, config)
     except ValueError as problem:
         raise ValueError(f"policy {file.source!r} cannot be loaded: {problem}") from problem
-    there, here = file.card.get("epsilon"), config.privacy.epsilon
-    if there != here and not allow:
+    others = _other_privacy(file.card["fits"]["privacy"], config.privacy)
+    if others and "privacy" not in allow:
         warnings.warn(
-            f"policy {file.source!r} was trained at epsilon {shown(there)}, and the environment "
-            f"has epsilon {here:g}",
+            f"policy {file.source!r} was trained for another release: {_in_words(others)}",
             stacklevel=1,
         )
     return ActingPolicy(policy, make_interface(config), file.card, normalisation)
@@ -220,6 +221,8 @@ def describe_road(corridor: Corridor) -> str:
 
 # The environment that a policy fits.
 
+_Pair = tuple[Any, Any]
+
 
 def _fit(config: EnvConfig, name: str) -> dict[str, Any]:
     """Return what an environment and a policy of class `name` must agree in, as plain JSON."""
@@ -232,6 +235,7 @@ def _fit(config: EnvConfig, name: str) -> dict[str, Any]:
         "corridor": config.corridor.digest,
         "bandwidth": config.bandwidth,
         "fixed_sensors": list(config.corridor.fixed_sensors),
+        "privacy": _privacy(config.privacy),
     }
     if config.corridor.loops is not None:
         fit["loops"] = config.corridor.loops.fields()
@@ -242,6 +246,38 @@ def _fit(config: EnvConfig, name: str) -> dict[str, Any]:
     if name == SHARED:
         fit["channels"] = [channel.name for channel in RoadChannels.from_config(config).channels]
     return fit
+
+
+def _privacy(settings: PrivacySettings) -> dict[str, Any]:
+    """Return what a release model is set to, as plain JSON, without where its noise comes from."""
+    plain = {
+        name: value if value is None or isinstance(value, str | int | float) else str(value)
+        for name, value in vars(settings).items()
+        if name != "noise"
+    }
+    named = {
+        "preset": RELEASE_MODELS.name_of(settings.preset),
+        "boundary_inputs": settings.boundary,
+    }
+    return plain | named
+
+
+def _other_privacy(there: Mapping[str, Any], settings: PrivacySettings) -> dict[str, _Pair]:
+    """Return by path the settings of a release that differ, for a policy and here."""
+    here = _privacy(settings)
+    # Another model has other settings beside those that all have.
+    all_have = [field.name for field in fields(PrivacySettings) if field.name in here]
+    names = here if there.get("preset") == here["preset"] else all_have
+    pairs = {f"privacy.{name}": (there.get(name), here[name]) for name in names}
+    return {path: pair for path, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def _in_words(pairs: Mapping[str, _Pair]) -> str:
+    """Return which values a policy and its environment have."""
+    return "; ".join(
+        f"{key} is {shown(there)} for the policy and {shown(here)} for the environment"
+        for key, (there, here) in pairs.items()
+    )
 
 
 def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str]) -> None:
@@ -276,10 +312,7 @@ def _check_fit(card: Mapping[str, Any], config: EnvConfig, allow: Collection[str
     differences = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
     refused = {key: pair for key, pair in differences.items() if key not in allow}
     if refused:
-        text = "; ".join(
-            f"{key} is {shown(there)} for the policy and {shown(here)} for the environment"
-            for key, (there, here) in refused.items()
-        )
+        text = _in_words(refused)
         if "action" in refused:
             text += f"; make the environment with action={shown(there['action'])}"
         elif all(key in TRANSFERABLE for key in refused):

@@ -1,5 +1,6 @@
 """Saved policies: they act as before, where they fit, and files that mislead are refused."""
 
+import contextlib
 import importlib
 import warnings
 
@@ -18,7 +19,7 @@ from torch import nn
 
 from dptse_env.config import resolve
 from dptse_env.parts import make_interface
-from dptse_env.policies import read_policy
+from dptse_env.policies import TRANSFERABLE, read_policy
 from dptse_env.sb3 import (
     ActingPolicy,
     RoadChannels,
@@ -247,12 +248,12 @@ def test_a_shared_network_moves_on_purpose_to_another_road_and_bandwidth(path):
             r"'paper-highway \(15 mainline .* and .short-highway .*allow bandwidth and",
         ),
         (("bandwidth",), r"corridor is .*to transfer it on purpose, allow corridor$"),
-        (("action",), "allow must be of corridor, bandwidth, got 'action'"),
+        (("action",), "allow must be of corridor, bandwidth, privacy, got 'action'"),
     ):
         with pytest.raises(ValueError, match=message):
             load_policy(path, env, allow=allow)
     with warnings.catch_warnings(action="error"):  # of another epsilon
-        loaded = load_policy(path, env, allow=("bandwidth", "corridor"))
+        loaded = load_policy(path, env, allow=TRANSFERABLE)
     # The same weights, made for the short road.
     direct, _ = untrained(bandwidth=3)
     direct.scorer.load_state_dict(policy.scorer.state_dict())
@@ -263,9 +264,45 @@ def test_a_shared_network_moves_on_purpose_to_another_road_and_bandwidth(path):
     )
 
 
-def test_another_epsilon_is_told_unless_the_policy_moves_on_purpose(stored):
-    with pytest.warns(UserWarning, match=r"was trained at epsilon 1\.0, and .* has epsilon 0\.3$"):
-        load_policy(stored, make_env(epsilon=0.3))
+@pytest.mark.parametrize(
+    ("trained", "here", "told"),
+    [
+        ({"epsilon": 5.0}, {"epsilon": 1.0}, r"epsilon is 5\.0 for .* and 1\.0 for the env\w+"),
+        ({"delta": 0.01}, {}, r"delta is 0\.01 for .* and 0\.05 for the environment"),
+        (
+            {"privacy": {"preset": "capped", "cap": 16}},
+            {"privacy": "capped", "epsilon": 2.0},
+            r"epsilon is 1\.0 .*; privacy\.cap is 16 for the policy and 64 for the environment",
+        ),
+        (
+            {"privacy": {"preset": "printed", "boundary_inputs": "nominal"}},
+            {"privacy": "corrected"},
+            r"preset is 'printed' for .* and 'corrected' .*boundary_inputs is 'nominal' for .*",
+        ),
+        ({}, {"privacy": {"noise": "secure"}}, None),
+        ({"privacy": {"boundary_inputs": "true"}}, {}, None),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:privacy.preset")
+def test_another_release_is_told_unless_it_is_allowed(path, trained, here, told):
+    save_policy(path, *untrained(**trained), **ABOUT)
+    env = make_env(**here)
+    context = contextlib.nullcontext() if told is None else pytest.warns(UserWarning, match=told)
+    with context as found:
+        load_policy(path, env, allow=("bandwidth", "corridor"))
+    assert found is None or len(found) == 1
+    with warnings.catch_warnings(action="error"):
+        load_policy(path, env, allow=("privacy",))
+
+
+def test_a_shipped_policy_tells_of_the_epsilon_of_the_id():
+    env = make_env(bandwidth=1, privacy="paced")
+    message = (
+        r"^policy 'short-highway-paced' was trained for another release: privacy\.epsilon is 5\.0 "
+        r"for the policy and 1\.0 for the environment$"
+    )
+    with pytest.warns(UserWarning, match=message):
+        load_policy("short-highway-paced", env)
 
 
 def test_a_perceptron_stays_on_its_road(path):
@@ -322,7 +359,8 @@ WRONG = {
     "slots": [
         (lambda c, w: c["fits"].update(format="dptse-policy-1"), "format is 'dptse-policy-1'"),
         (lambda c, w: c["fits"].update(action="x" * 10**5), r"action is 'x+\.\.\.x+' for .*;"),
-        (lambda c, w: c["fits"].update(dict.fromkeys(c["fits"], 400 * "x"), action="slots"),
+        (lambda c, w: c["fits"].update(dict.fromkeys(c["fits"], 400 * "x"), action="slots",
+                                  privacy={}),
          r"format is 'x+\.\.\.x+' for .*; corridor is .* for the environment$"),
         (lambda c, w: c["fits"]["channels"].append("colour"), r"channels is \['colour'\] for the"),
         (lambda c, w: c["fits"].update(channels=[{}] * 9), r"channels is \['\{\}'\] for the"),
@@ -399,7 +437,7 @@ def test_edited_cards_are_refused_or_act(acting, data):
     path = good.with_name("edited.safetensors")
     path.write_bytes(edited(good, change))
     try:
-        policy = load_policy(path, env, allow=("corridor", "bandwidth"))
+        policy = load_policy(path, env, allow=TRANSFERABLE)
     except ValueError as problem:
         refusal = str(problem)
     else:
