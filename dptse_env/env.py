@@ -118,14 +118,14 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | ``prices``          | under ``paced``: last price of each query, 0 before, shape (G,)   |
     | ``spent_share``     | under ``paced``: as in the observation, shape (n,)                |
     | ``centre_fallback`` | under ``paced``: 1 if no prediction was finite to centre flows on |
-    | ``truth``           | true traffic, with ``truth_in_info=True`` only                    |
-    | ``privacy``         | at the reset only: the guarantee and its account, see `privacy`   |
-    | ``inherited``       | at the reset only: keywords whose values are not of this road     |
+    | ``true_density``    | with ``truth_in_info``: of each segment [veh/km], shape (S,)      |
+    | ``true_speed``      | with ``truth_in_info``: of each segment [km/h], shape (S,)        |
+    | ``time``            | with ``truth_in_info``: second of the record; true traffic        |
 
     Values marked "true traffic" serve training and evaluation, as the reward does. They are not
     covered by the guarantee, and no policy may act on them. The others are public. ``spent_mu`` and
     ``spent_epsilon`` read like an odometer: what is guaranteed is the budget of a complete episode,
-    ``mu`` in ``privacy``.
+    in `guarantee` and `privacy`.
 
     **Arguments** of ``gym.make``, with the defaults of ``PaperHighway-v0``. All are plain JSON, but
     for parts of your own (a class or ``"package.module:Class"``). `EnvConfig` names the classes of
@@ -178,7 +178,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
         >>> import gymnasium as gym
         >>> env = gym.make("dptse_env:dptse/ShortHighway-v0", bandwidth=3, horizon=60)
         >>> observation, info = env.reset(seed=0)
-        >>> env.action_space, observation.shape, info["privacy"]["guarantee"]
+        >>> env.action_space, observation.shape, env.unwrapped.privacy()["guarantee"]
         (MultiBinary(6), (74,), 'none')
         >>> total, truncated = 0.0, False
         >>> while not truncated:
@@ -248,7 +248,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
         outcome = self.process.reset(_ONLY, [self.np_random], options)
         if self.drawing is not None:
             self.drawing.begin(self.process)
-        return outcome.observation[0], {**self.process.info(0), **self.process.reset_info()}
+        return outcome.observation[0], self.process.info(0)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Query, estimate and score a step.

@@ -107,6 +107,12 @@ class QueryEnvBase:
             )  # fmt: skip
         return self._process
 
+    def guarantee(self) -> str:
+        """Return the guarantee of an episode in one line, or "none" with what voids it."""
+        report = self.privacy()
+        reasons = ", ".join(report["void_reasons"])
+        return f"none: {reasons}" if reasons else str(report["guarantee"])
+
     def privacy(self) -> dict[str, Any]:
         """Return the guarantee of an episode, or what voids it, and the account behind it."""
         return self.process.privacy()

@@ -41,7 +41,10 @@ from dptse_env.utils.threads import EpisodeThreads
 from dptse_env.utils.validation import shown
 from dptse_env.utils.vector_info import Infos, info_of
 
-TRUTH_INFO = ("rmse_density", "rmse_speed", "n_occupied", "traffic_seed", "truth")
+TRUTH_INFO = (
+    "rmse_density", "rmse_speed", "n_occupied", "traffic_seed", "true_density", "true_speed",
+    "time",
+)  # fmt: skip
 """Keys of ``info`` that come from the true traffic, or name its record; the others are public."""
 
 
@@ -415,14 +418,6 @@ class QueryProcess:
         """Return the privacy report of the parts in force, as plain JSON."""
         return complete_report(self.config, self.release, self.boundary).to_dict()
 
-    def reset_info(self) -> dict[str, Any]:
-        """Return the part of ``info`` that is added at a reset, the same for all episodes.
-
-        ``privacy`` is the privacy report, ``inherited`` the keywords whose values were measured or
-        tuned on another road, or are settings that nobody tuned.
-        """
-        return {"privacy": self.privacy(), "inherited": list(self.config.inherited)}
-
     def info(self, episode: int) -> dict[str, Any]:
         """Return the info of one episode, in plain numbers."""
         return info_of(self.infos(np.array([episode])), 0)
@@ -449,17 +444,13 @@ class QueryProcess:
             **self.release.public(episodes),
         }
         if self.config.truth_in_info:
-            infos["truth"] = self._truth_infos(episodes)
+            truth = self.truth(episodes)
+            infos["true_density"], infos["true_speed"] = (
+                truth[:, :, 0].copy(),
+                truth[:, :, 1].copy(),
+            )
+            infos["time"] = self.time[episodes].astype(np.float64)
         return infos
-
-    def _truth_infos(self, episodes: IntArray) -> Infos:
-        truth, traffic = self.truth(episodes), self.traffic_index[episodes]
-        return {
-            "density": truth[:, :, 0].copy(),
-            "speed": truth[:, :, 1].copy(),
-            "time": self.time[episodes],
-            **self.release.private(episodes, traffic),
-        }
 
 
 def _seed_of(generator: np.random.Generator) -> np.random.SeedSequence:

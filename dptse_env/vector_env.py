@@ -20,7 +20,7 @@ from dptse_env.rendering import Drawing
 from dptse_env.traffic import Records
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
 from dptse_env.utils.validation import integer, require, require_name
-from dptse_env.utils.vector_info import Infos, in_vector_form, object_array, repeated_infos
+from dptse_env.utils.vector_info import Infos, in_vector_form, object_array
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
 
@@ -48,14 +48,12 @@ class Transition:
         observation: Shape (n, size).
         reward: Shape (n,); zero where an episode was reset instead of stepped.
         truncated: Whether the horizon is reached, shape (n,).
-        was_reset: Whether an episode was reset, shape (n,).
         final: In same-step mode, the final states of the episodes that ended; None if none did.
     """
 
     observation: Observation
     reward: FloatArray
     truncated: BoolArray
-    was_reset: BoolArray
     final: FinalStates | None
 
 
@@ -180,7 +178,7 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
                 choices[key] = [values[episode] for episode in episodes]
         self._seed(episodes, seed)
         self._reset(episodes, choices)
-        return self._observation.copy(), self._infos(episodes, episodes)
+        return self._observation.copy(), self._infos(episodes)
 
     def step(
         self, actions: Action
@@ -193,7 +191,7 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
                 disabled.
         """
         transition = self.advance(actions)
-        infos = self._infos(self._all, np.flatnonzero(transition.was_reset))
+        infos = self._infos(self._all)
         final = transition.final
         if final is not None:
             ended: Infos = {"final_obs": object_array(list(final.observation))}
@@ -232,7 +230,7 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
             final = FinalStates(done, self._observation[done], self.process.infos(done))
         if to_reset.any():
             self._reset(np.flatnonzero(to_reset))
-        return Transition(self._observation.copy(), reward, truncated, to_reset, final)
+        return Transition(self._observation.copy(), reward, truncated, final)
 
     def action_masks(self) -> BoolArray:
         """Return flags of the queries that may be picked next, shape (n, G), for ``sequential``.
@@ -263,13 +261,8 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         if self.drawing is not None and self.render_episode in episodes:
             self.drawing.begin(self.process)
 
-    def _infos(self, episodes: IntArray, reset: IntArray) -> dict[str, Any]:
-        """Return the infos of ``episodes``, and the reset infos of those in ``reset``."""
-        infos = in_vector_form(self.process.infos(episodes), episodes, self.num_envs)
-        if reset.size:
-            at_reset = repeated_infos(self.process.reset_info(), len(reset))
-            infos |= in_vector_form(at_reset, reset, self.num_envs)
-        return infos
+    def _infos(self, episodes: IntArray) -> dict[str, Any]:
+        return in_vector_form(self.process.infos(episodes), episodes, self.num_envs)
 
     def _generator(self, episode: int) -> tuple[np.random.Generator, int]:
         """Return the generator of an episode and its seed, drawn by the system if none is set."""

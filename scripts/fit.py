@@ -331,7 +331,7 @@ def chosen_keywords(choice: Choice, road: Road) -> dict[str, Any]:
 
 
 def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:
-    """Say which values of other roads stay in force, as ``info["inherited"]`` does."""
+    """Say which values of other roads stay in force, as a warning does."""
     road = choice.road
     played = {**road.keywords, **keywords, "corridor": str(choice.place.folder / PLAYED)}
     with quietly():

@@ -15,7 +15,7 @@ from dptse_env.env import SensorQueryEnv
 from dptse_env.process import TRUTH_INFO
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
-from tests.helpers import SHORT, assert_same, briefly, fast_and_slow, make_env, play
+from tests.helpers import COUNTED, PAID, SHORT, assert_same, briefly, fast_and_slow, make_env, play
 
 IDS = [f"dptse_env:{env_id}" for env_id in ENVIRONMENTS]
 EVERY = sorted({(each, "mask") for each in IDS} | {(SHORT, name) for name in ACTION_ENCODINGS})
@@ -75,7 +75,7 @@ def test_sequential_actions_move_the_traffic_on_their_last_pick():
     while not truncated:
         free = env.unwrapped.action_masks()
         _, reward, _, truncated, info = env.step(np.flatnonzero(free)[0])
-        times.append(info["truth"]["time"])
+        times.append(info["time"])
         rewards.append(reward)
         masks.append(int(free.sum()))
     assert times == [0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5]
@@ -83,32 +83,44 @@ def test_sequential_actions_move_the_traffic_on_their_last_pick():
     assert [reward == 0 for reward in rewards] == [True, True, False] * 5
 
 
-def test_info_has_the_same_finite_numbers_at_every_step():
-    (_, at_reset), *steps = play(make_env(), 30)
-    assert at_reset.pop("privacy")["guarantee"] == "none"
-    assert at_reset.pop("inherited") == []
+EVERY_INFO = [
+    {},
+    {"truth_in_info": True, "privacy": COUNTED},
+    {"privacy": PAID, "action": "sequential"},
+    {"privacy": "paced", "epsilon": 5, "query_every": 4, "penetration": 0.5},
+]
+
+
+@pytest.mark.parametrize("keywords", EVERY_INFO)
+def test_info_has_the_same_flat_finite_numbers_at_the_reset_and_every_step(keywords):
+    (_, at_reset), *steps = play(make_env(**keywords), 30)
     for info in [at_reset, *(step[4] for step in steps)]:
-        numbers = {**info}
-        flags = numbers.pop("queried")
-        assert type(numbers.pop("traffic_seed")) is int
-        assert (flags.dtype, flags.sum() <= 2) == (bool, True)
         assert info.keys() == at_reset.keys()
-        assert all(type(value) is float and np.isfinite(value) for value in numbers.values())
+        assert type(info["traffic_seed"]) is int
+        assert info["queried"].dtype == bool
+        for key, value in info.items():
+            array = np.asarray(value)
+            assert np.isfinite(array).all()
+            assert (array.shape, array.dtype) == (
+                np.shape(at_reset[key]),
+                np.asarray(at_reset[key]).dtype,
+            )
+            assert isinstance(value, np.ndarray) or type(value) in (int, float)
 
 
 def test_truth_is_shown_only_on_request():
-    assert "truth" not in make_env().reset(seed=0)[1]
+    assert not {"true_density", "true_speed", "time"} & {*make_env().reset(seed=0)[1]}
     info = make_env(truth_in_info=True).reset(seed=0)[1]
-    assert set(info["truth"]) == {"density", "speed", "time"}
     assert set(TRUTH_INFO) <= set(info)
+    assert info["true_density"].shape == info["true_speed"].shape == (8,)
 
 
 def test_reset_options_choose_the_traffic_and_the_start_and_leave_the_rest():
     env = make_env(horizon=50, random_start=True, truth_in_info=True)
     info = env.reset(seed=0, options={"traffic_seed": 2, "start": 100})[1]
-    assert (info["traffic_seed"], info["truth"]["time"]) == (2, 100)
+    assert (info["traffic_seed"], info["time"]) == (2, 100)
     assert env.step(env.action_space.sample())[4]["traffic_seed"] == 2
-    starts = {env.reset()[1]["truth"]["time"] for _ in range(30)}
+    starts = {env.reset()[1]["time"] for _ in range(30)}
     assert len(starts) > 10
     assert max(starts) <= 190
     free = play(env, 10, seed=9)

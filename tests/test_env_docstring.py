@@ -71,7 +71,7 @@ def test_its_keys_of_info_are_those_of_episodes(privacy):
         keys = [key for key in keys if key not in ("prices", "spent_share", "centre_fallback")]
     at_reset = env.reset(seed=0)[1]
     assert {*at_reset} == {*keys}
-    assert {*env.step(np.zeros(6, np.int8))[4]} == {*keys} - {"privacy", "inherited"}
+    assert {*env.step(np.zeros(6, np.int8))[4]} == {*keys}
 
 
 def test_its_arguments_are_all_there_are_and_give_the_defaults():

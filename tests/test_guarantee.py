@@ -38,11 +38,12 @@ CAPPED, PACED = {"preset": "capped", "cap": 5}, {"preset": "paced", "epsilon": 0
         (PACED, "0.49184-Gaussian differential privacy, which is (0.5, 0.05)-", {"clip": 25.0}),
     ],
 )
-def test_the_account_is_in_info_and_grows_up_to_the_guarantee(privacy, claim, settings):
+def test_what_is_spent_grows_up_to_the_guarantee(privacy, claim, settings):
     env = make_env(privacy=privacy, horizon=80, random_start=True)
     (_, at_reset), *steps = play(env, 80)
-    account, infos = at_reset["privacy"], [at_reset, *(step[4] for step in steps)]
+    account, infos = env.unwrapped.privacy(), [at_reset, *(step[4] for step in steps)]
     assert json.loads(json.dumps(account, allow_nan=False)) == account
+    assert account["guarantee"] == env.unwrapped.guarantee()
     assert account["guarantee"].startswith(claim)
     assert account["void_reasons"] == []
     assert account.items() >= {"unit": "trip", "adjacency": "replace", **settings}.items()
@@ -55,7 +56,7 @@ def test_the_account_is_in_info_and_grows_up_to_the_guarantee(privacy, claim, se
     if "cap" in settings:
         counted = np.minimum(np.arange(81), 5)
         np.testing.assert_allclose(mus, account["mu"] * np.sqrt(counted / 5), rtol=1e-12)
-    private = {"exposures", "ledgers", "individual_epsilon", "n_refused", "truth"}
+    private = {"exposures", "ledgers", "individual_epsilon", "n_refused", "time"}
     assert not any(private & set(info) for info in infos)
 
 
@@ -63,7 +64,8 @@ def test_a_void_guarantee_is_warned_of_when_the_environment_is_made():
     with pytest.warns(UserWarning, match="boundary_inputs") as caught:
         env = make_env(privacy=CAPPED | {"boundary_inputs": "true"})
     assert len(caught) == 1
-    account = env.reset(seed=0)[1]["privacy"]
+    assert env.unwrapped.guarantee() == "none: boundary_inputs"
+    account = env.unwrapped.privacy()
     assert account["guarantee"] == "none"
     assert account["void_reasons"] == ["boundary_inputs"]
 
@@ -71,27 +73,29 @@ def test_a_void_guarantee_is_warned_of_when_the_environment_is_made():
 @pytest.mark.parametrize(
     ("privacy", "what", "most"), [(CAPPED, "exposures", 5), (PACED, "ledgers", 1.0)]
 )
-def test_what_vehicles_have_spent_is_shown_with_the_truth(privacy, what, most):
+def test_no_vehicle_has_spent_more_than_info_says(privacy, what, most):
     env = make_env(privacy=privacy, truth_in_info=True)
     env.action_space.seed(0)
-    _, info = env.reset(seed=0, options={"traffic_seed": 0})
-    assert info["privacy"]["void_reasons"] == ["truth_in_info"]
-    refused = 0
+    env.reset(seed=0, options={"traffic_seed": 0})
+    assert env.unwrapped.privacy()["void_reasons"] == ["truth_in_info"]
+    process, refused = env.unwrapped.process, 0
     for _ in range(100):
         *_, info = env.step(env.action_space.sample())
-        spent, epsilons = (np.array(info["truth"][key]) for key in (what, "individual_epsilon"))
+        private = process.release.private(ONE, process.traffic_index)
+        spent, epsilons = (np.array(private[key][0]) for key in (what, "individual_epsilon"))
         assert spent.max(initial=0) <= most
         assert epsilons.max(initial=0) <= info["spent_epsilon"] * (1.0 + 1e-9)
-        refused += info["truth"].get("n_refused", 0)
+        refused += np.sum(private.get("n_refused", 0))
     assert spent.max() > 0.9 * most
     assert (spent == 0).any()
     assert (epsilons[spent == 0] == 0.0).all()
     assert (epsilons[spent > 0.1 * most] > 0.0).all()
     assert (refused > 0) == (what == "ledgers")
-    assert len(spent) == len(epsilons) == env.unwrapped.process.traffic.record(0).n_vehicles
-    _, again = env.reset(options={"traffic_seed": 0})
-    assert not any(again["truth"][what])
-    assert not any(again["truth"]["individual_epsilon"])
+    assert len(spent) == len(epsilons) == process.traffic.record(0).n_vehicles
+    env.reset(options={"traffic_seed": 0})
+    again = process.release.private(ONE, process.traffic_index)
+    assert not any(again[what][0])
+    assert not any(again["individual_epsilon"][0])
 
 
 def test_a_spec_with_every_keyword_of_paced_ledgers_survives_json():

@@ -1,7 +1,6 @@
 """An environment on a road of one's own, from a road file."""
 
 import dataclasses
-import json
 import warnings
 from pathlib import Path
 
@@ -73,7 +72,7 @@ def test_weights_on_a_road_unlike_those_of_their_training_are_named(road_file):
     name = "estimator_settings.recurrent.weights"
     with pytest.warns(UserWarning, match=f"{name}: values measured or tuned on"):
         env = gym.make(ID, corridor=road_file, traffic_seeds=[0], estimator="recurrent")
-    assert name in env.reset(seed=0)[1]["inherited"]
+    assert name in env.unwrapped.config.inherited
     assert gym.make(ID, estimator="recurrent").unwrapped.config.inherited == ()
 
 
@@ -139,14 +138,13 @@ def test_python_tells_once_what_is_not_of_the_road(road_file):
     assert len(told) == 1
 
 
-def test_a_reset_names_what_is_not_of_the_road(tmp_path):
+def test_a_configuration_names_what_is_not_of_the_road(tmp_path):
     path = tmp_path / "plain.toml"
     path.write_text("n_mainline = 5\nduration = 60\nlanes = 2\n[demand]\nmainline = [[0, 1500]]\n")
     with pytest.warns(UserWarning, match="on another road"):
         env = gym.make(ID, corridor=str(path), traffic_seeds=[0], bandwidth=2)
-    _, info = env.reset(seed=0)
     inherited = {"corridor.average_dwell", "parameters", "estimator_settings"}
-    assert {*json.loads(json.dumps(info["inherited"]))} == inherited
+    assert {*env.unwrapped.config.inherited} == inherited
 
 
 MINE = {
@@ -168,7 +166,7 @@ def test_parameters_of_ones_own_keep_the_settings_of_those_they_come_from(source
     with pytest.warns(UserWarning, match="^estimator_settings: .*or with other parameters"):
         env = gym.make(ID, parameters=mine, traffic_seeds=[0], **keywords)
     assert env.unwrapped.config.settings() == load_settings(name)
-    assert env.reset(seed=0)[1]["inherited"] == ["estimator_settings"]
+    assert env.unwrapped.config.inherited == ("estimator_settings",)
 
 
 def test_a_set_of_ones_own_with_the_name_of_a_shipped_one_is_no_shipped_one():

@@ -111,10 +111,10 @@ def test_traffic_start_and_seeds_one_by_one():
         alone, info = single.reset(seed=seed, options=own)
         np.testing.assert_array_equal(observation[episode], alone[0])
         assert infos["traffic_seed"][episode] == info["traffic_seed"][0] == own["traffic_seed"]
-        assert infos["truth"]["time"][episode] == info["truth"]["time"][0]
+        assert infos["time"][episode] == info["time"][0]
     options["reset_mask"] = np.array([False, True, True])
     options["start"] = [999, 7, 8]  # of an episode that goes on, and so never looked at
-    assert env.reset(options=options)[1]["truth"]["time"].tolist() == [0, 7, 8]
+    assert env.reset(options=options)[1]["time"].tolist() == [0, 7, 8]
     env.reset(seed=[8, None, 9])
     assert env.np_random_seed == (8, 9, 9)
 

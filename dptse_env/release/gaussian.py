@@ -373,9 +373,8 @@ class Capped(GaussianRelease):
     def private(self, episodes: IntArray, traffic: IntArray) -> Infos:
         """Return each vehicle's contributions, and the epsilon that it has spent.
 
-        Lists, since records differ in their number of vehicles and Gymnasium stacks arrays of equal
-        shape only. ``exposures`` are contributions to queries; those to a second group of channels
-        are ``sensor_exposures``.
+        Lists, since records differ in their number of vehicles. ``exposures`` are contributions to
+        queries; those to a second group of channels are ``sensor_exposures``.
         """
         counted = self.ledgers.of(episodes, self.traffic.n_vehicles[traffic])
         # A vehicle that has counted k times has spent the budget of a cap of k.

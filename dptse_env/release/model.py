@@ -141,7 +141,7 @@ class ReleaseModel(ABC):
         return {}
 
     def private(self, episodes: IntArray, traffic: IntArray) -> Infos:
-        """Return private data for ``info["truth"]`` alone, of k episodes; by default none."""
+        """Return what vehicles of k episodes have paid, for tests alone; by default nothing."""
         return {}
 
     def budgets_spent(self, episodes: IntArray) -> FloatArray:

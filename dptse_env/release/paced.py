@@ -270,9 +270,8 @@ class Paced(ReleaseModel):
     def private(self, episodes: IntArray, traffic: IntArray) -> Infos:
         """Return what each vehicle has paid over its budget, its epsilon, and refusals.
 
-        The first two are lists, since records differ in their number of vehicles and Gymnasium
-        stacks arrays of equal shape only. ``ledgers`` are those of the queries; those of a second
-        group of channels are ``sensor_ledgers``.
+        The first two are lists, since records differ in their number of vehicles. ``ledgers`` are
+        those of the queries; those of a second group of channels are ``sensor_ledgers``.
         """
         paid = self.ledgers.of(episodes, self.traffic.n_vehicles[traffic])
         infos: Infos = {

@@ -40,7 +40,7 @@ VOID_REASONS: Mapping[str, str] = MappingProxyType(
             "and so depend on each vehicle in them: take them from other traffic, such as that of "
             "another day, and empty it"
         ),
-        "truth_in_info": "info['truth'] shows the true traffic and what each vehicle contributed",
+        "truth_in_info": "info shows the true traffic",
     }
 )
 """Reasons against a guarantee with an explanation each, in the order of reports."""

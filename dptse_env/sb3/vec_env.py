@@ -187,9 +187,8 @@ class SB3VecEnv(VecEnv):
     def _note_resets(self, episodes: Sequence[int] | NDArray[np.int64] | range) -> None:
         """Store the infos of resets where stable-baselines3 looks for them."""
         infos = self.env.process.infos(np.asarray(episodes))
-        at_reset = self.env.process.reset_info()
         for k, episode in enumerate(episodes):
-            self.reset_infos[episode] = {**info_of(infos, k), **at_reset}
+            self.reset_infos[episode] = info_of(infos, k)
 
 
 def config_of(env: Any) -> EnvConfig:

@@ -1,7 +1,7 @@
 """Conversion of per-episode info between batches, scalar dicts and Gymnasium's vector form.
 
-*Infos* of k episodes are a dict of arrays with a leading axis of length k, or of such dicts.
-Gymnasium's vector form has arrays over all n episodes and, under the same key with a leading
+*Infos* of k episodes are a dict of arrays with a leading axis of length k. Gymnasium's vector form
+has arrays over all n episodes and, under the same key with a leading
 underscore, the flags of the episodes that have a value.
 """
 
@@ -19,10 +19,7 @@ Infos = dict[str, Any]
 def info_of(infos: Mapping[str, Any], k: int) -> dict[str, Any]:
     """Return the info of the k-th of some episodes: plain numbers, and fresh arrays of others."""
     return {
-        key: info_of(value, k)
-        if type(value) is dict
-        else (value.item(k) if value.ndim == 1 else value[k].copy())
-        for key, value in infos.items()
+        key: value.item(k) if value.ndim == 1 else value[k].copy() for key, value in infos.items()
     }
 
 
@@ -32,19 +29,6 @@ def object_array(values: list[Any]) -> NDArray[np.object_]:
     for k, value in enumerate(values):
         objects[k] = value
     return objects
-
-
-def repeated_infos(info: Mapping[str, Any], k: int) -> Infos:
-    """Return the infos of k episodes that have the same one; lists and dicts are shared."""
-    infos: Infos = {}
-    for key, value in info.items():
-        if isinstance(value, Mapping):
-            infos[key] = repeated_infos(value, k)
-        elif isinstance(value, bool | int | float):
-            infos[key] = np.full(k, value)
-        else:
-            infos[key] = object_array([value] * k)
-    return infos
 
 
 def in_vector_form(given: Mapping[str, Any], episodes: IntArray, n_episodes: int) -> dict[str, Any]:

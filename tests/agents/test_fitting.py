@@ -426,7 +426,7 @@ def test_a_measured_field_with_one_test_window_is_fitted(tmp_path):
     assert "There is one test window: its errors have no interval" in page
     with pytest.warns(UserWarning, match="^estimator_settings: "):
         env = gym.make(ID, corridor=str(path))
-    assert env.reset(seed=0)[1]["inherited"] == ["estimator_settings"]
+    assert env.unwrapped.config.inherited == ("estimator_settings",)
 
 
 def test_recordings_of_one_window_say_what_is_missing(tmp_path):

@@ -17,6 +17,7 @@ from dptse_env.estimators import Estimate
 from dptse_env.evaluation import evaluate
 from dptse_env.parts import make_release
 from dptse_env.traffic import RecordLibrary
+from dptse_env.utils.vector_info import info_of
 from tests.helpers import SHORT
 
 N_MAINLINE = 6
@@ -32,20 +33,23 @@ def watch(privacy, watchers=("contributions",), **keywords):
 
 
 def truth_of(privacy, seed):
-    """Return the sum of refused contributions and the last ``truth`` of an episode."""
+    """Return the sum of refused contributions, and what vehicles have paid in the end."""
     keywords = {"estimator": "ekf", "privacy": privacy, "traffic_seeds": [seed]}
-    env = gym.make(SHORT, disable_env_checker=True, truth_in_info=True, **keywords)
+    env = gym.make(SHORT, disable_env_checker=True, **keywords)
     process, refused = env.unwrapped.process, []
+
+    def private():
+        return info_of(process.release.private(np.array([0]), process.traffic_index), 0)
 
     class Noting:
         def __call__(self):
-            refused.append(process.info(0)["truth"].get("n_refused", 0))
+            refused.append(private().get("n_refused", 0))
 
         def rows(self):
             return [{}]
 
     evaluate(env, "round-robin", [seed], watchers=[lambda process: Noting()])
-    return sum(refused), process.info(0)["truth"]
+    return sum(refused), private()
 
 
 @pytest.fixture(scope="module")

@@ -228,15 +228,16 @@ def test_an_error_of_a_sensor_changes_what_it_measures_alone_and_no_release():
 
 
 def test_a_silent_sensor_is_not_observed_and_charges_nobody():
-    process = begun(sensor_settings={"dropout": 0.9}, truth_in_info=True)
-    often = begun(truth_in_info=True)
+    process, often = begun(sensor_settings={"dropout": 0.9}), begun()
     found = play(process, 40)
     play(often, 40)
     answered = np.array([released.observed[0, COLUMNS] for released, *_ in found])
     assert abs(answered.mean() - 0.1) < 0.1
     told = np.array([measured.observed[0, COLUMNS] for *_, measured in found])
     np.testing.assert_array_equal(told, answered)
-    paid = [np.sum(p.info(0)["truth"]["sensor_ledgers"]) for p in (process, often)]
+    one = np.array([0])
+    private = [p.release.private(one, p.traffic_index) for p in (process, often)]
+    paid = [np.sum(each["sensor_ledgers"][0]) for each in private]
     assert 0.0 < paid[0] < 0.3 * paid[1]
 
 

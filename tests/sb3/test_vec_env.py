@@ -59,12 +59,12 @@ def test_seeds_and_options_hold_for_one_reset():
     env.set_options([{"start": 7}, {"start": 9, "traffic_seed": 1}, {"start": 7}])
     env.reset()
     first = env.step(ACTIONS)[1]
-    assert [info["truth"]["time"] for info in env.reset_infos] == [7, 9, 7]
+    assert [info["time"] for info in env.reset_infos] == [7, 9, 7]
     assert env.reset_infos[1]["traffic_seed"] == 1
     starts = set()
     for _ in range(6):
         env.reset()
-        starts |= {info["truth"]["time"] for info in env.reset_infos}
+        starts |= {info["time"] for info in env.reset_infos}
     assert len(starts) > 5
     assert (env.step(ACTIONS)[1] != first).all()
     for options in ({"reset_mask": np.ones(3, bool)}, {"stop": 3}):
@@ -178,7 +178,7 @@ def test_replicas_meet_the_same_traffic_and_noise_after_resets_too(seed, keyword
             assert dones.all() or rewards[0] == 0.0 or rewards[0] != rewards[3]
         groups = groups_of(env, observation)
         assert (groups == groups[:, :1]).all()
-        places = [(info["traffic_seed"], info["truth"]["time"]) for info in env.reset_infos]
+        places = [(info["traffic_seed"], info["time"]) for info in env.reset_infos]
         assert places[:3] == places[:1] * 3
         assert places[3:] == places[3:4] * 3
         starts |= {places[0], places[3]}
@@ -197,7 +197,7 @@ def test_what_a_replica_does_changes_nothing_for_the_others():
     for one, other in zip(alike, apart, strict=False):
         assert (one[1:] == other[1:]).all()
     assert any((one[0] != other[0]).any() for one, other in zip(alike, apart, strict=False))
-    assert len({info["truth"]["time"] for info in env.reset_infos}) == 1
+    assert len({info["time"] for info in env.reset_infos}) == 1
 
 
 class Look(BaseCallback):

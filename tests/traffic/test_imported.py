@@ -156,5 +156,5 @@ def test_environments_replay_recordings(recorded):
     env.reset(seed=0)
     for _ in range(3):
         info = env.step(np.zeros(6, dtype=np.int8))[4]
-    np.testing.assert_allclose(info["truth"]["density"], [0, 0, 0, 10, 0, 0, 0, 0])
-    assert info["truth"]["speed"][3] == pytest.approx(52.0)
+    np.testing.assert_allclose(info["true_density"], [0, 0, 0, 10, 0, 0, 0, 0])
+    assert info["true_speed"][3] == pytest.approx(52.0)

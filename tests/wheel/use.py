@@ -48,7 +48,8 @@ def use_parts_of_another_package() -> None:
     keywords = {kind: f"plugin-{kind}" for kind in kinds}
     keywords["observation"] = ["default", "plugin-observation"]
     env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords)
-    assert env.reset(seed=0)[1]["privacy"]["preset"] == "plugin-privacy"
+    env.reset(seed=0)
+    assert env.unwrapped.privacy()["preset"] == "plugin-privacy"
     assert np.isfinite(env.step(env.action_space.sample())[1])
     envs = gym.make_vec(
         "dptse_env:dptse/ShortHighway-v0",

@@ -111,7 +111,7 @@ def test_exact_releases_the_true_densities_of_what_is_queried_and_claims_nothing
     for _ in range(120):
         action, state = schedule.predict(observation, state)
         observation, _, _, _, info = env.step(action)
-        truth = info["truth"]["density"][:n][info["queried"]]
+        truth = info["true_density"][:n][info["queried"]]
         released = env.unwrapped.process.released[0, :n, 0][info["queried"]]
         np.testing.assert_allclose(released, truth, atol=0.1)
         largest = max(largest, *truth)

@@ -73,7 +73,7 @@ def test_squared_errors_are_those_of_density_and_speed_in_units_of_their_scales(
     observation, _ = env.reset(seed=0)
     for _ in range(50):
         observation, *_, info = env.step(np.eye(2, 6, dtype=np.int8).sum(axis=0))
-    density, speed = (info["truth"][name][:6] for name in ("density", "speed"))
+    density, speed = (info[f"true_{name}"][:6] for name in ("density", "speed"))
     squared = squared_errors(env.unwrapped.process)
     block = env.unwrapped.interface.observations.block
     estimated = [block(observation, name)[:6] for name in ("density", "speed")]
