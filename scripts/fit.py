@@ -3,9 +3,10 @@ r"""Fit parameters, estimator and query policy to a road, and write them into it
 dptse fit my-road.toml
 
 It records traffic that is missing, fits ARZ parameters by the filter's error on training traffic,
-chooses parameters, estimator and query policy on validation traffic, and plays them once on test
-traffic. The folder my-road-fit gets fit.md, which says what to do next. With --tune it searches
-settings of estimators instead, of the road or of --env. The same command goes on after Ctrl-C.
+chooses an estimator with its parameters and a query policy on validation traffic, and plays them
+once on test traffic. The folder my-road-fit gets fit.md, which says what to do next. With --tune it
+searches settings of estimators instead, of the road or of --env. The same command goes on after
+Ctrl-C.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from agents.fitting.choice import (
     ROUND_ROBIN,
     Choice,
 )
-from agents.fitting.page import DIAGRAM, PAGE, draw_diagram, verdict, write_page
+from agents.fitting.page import DIAGRAM, PAGE, draw_diagram, reason, verdict, write_page
 from agents.fitting.parameters import Fit, fit_parameters, is_stable, start_from, traffic_of
 from agents.fitting.road import PLAYED, Road, find_road, require_road, seeds_of
 from agents.fitting.road_file import copy_of, write_choice
@@ -41,7 +42,7 @@ from agents.play import Cell
 from agents.search.space import SPACE, Extra
 from agents.search.tuning import Search, chosen, tune, write_set
 from agents.seeds import KINDS, TUNING
-from agents.tables import ERROR, Labels, values
+from agents.tables import Labels
 from agents.terminal import make_table
 from dptse_env.estimators import check_estimator
 from dptse_env.estimators.tuned import DEFAULT_PARAMETERS, tuned_with
@@ -175,42 +176,30 @@ def fit_road(args: Args, path: Path) -> None:
     """Fit, choose, evaluate, and write the page and the road file."""
     folder = args.output or folder_of(path)
     road, stages, copy = checked_road(args, path, folder), folder / STAGES, copy_of(path)
-    args.remark("[1/6] record traffic")
+    args.remark("[1/5] record traffic")
     library = args.library(road.config.corridor, road.all_seeds)
     dwell = road.measure_dwell(library)
     keep_plan(folder, road.plan(args.trials))
     road.write_played(stages, dwell)
     choice = Choice(road, args.place(stages), shipped_sets(road))
-    args.remark("[2/6] fit ARZ parameters")
+    args.remark("[2/5] fit ARZ parameters")
     density, speed = traffic_of(road.config.corridor, road.seeds["training"], library)
     fit = fitted(choice, library, args.trials, 1.01 * float(density.max()))
     name = fit.parameters.name
     keep(folder / f"{name}.json", fit, road)
     choice.sets[name] = {"parameters": str(folder / f"{name}.json")}
-    args.remark("[3/6] choose parameters")
-    choice.parameters = choice.home
-    choice.choose([{"parameters": each} for each in choice.sets])
+    args.remark("[3/5] choose an estimator and parameters")
+    options = estimators_tried(choice, args, name)
+    choice.choose("estimator", options)
+    args.remark("[4/5] choose a query policy")
+    choice.choose("policy", [{"policy": each} for each in args.policies or POLICIES_TRIED])
+    if choice.policy != ROUND_ROBIN:
+        choice.choose("estimator", options)
     note_parameters(choice, fit)
-    if args.keep_fitted:
-        choice.parameters = name
-    args.remark("[4/6] choose an estimator")
-    estimators = args.estimators or ESTIMATORS_TRIED
-    options: list[Labels] = [{"estimator": each} for each in estimators]
-    if road.present:
-        choice.sets[PRESENT] = dict(road.present)
-        estimator = str(road.present.get("estimator", road.config.estimator))
-        options.append({"parameters": PRESENT, "estimator": estimator})
-    choice.choose(options)
-    args.remark("[5/6] choose a query policy")
-    policies = args.policies or POLICIES_TRIED
-    choice.choose([{"policy": each} for each in policies])
-    args.remark("[6/6] evaluate on test traffic, and over bandwidth and epsilon")
-    wanted = [
-        {}, {"estimator": FILTER, "policy": ROUND_ROBIN}, {"policy": ROUND_ROBIN},
-        *({"estimator": each, "policy": ROUND_ROBIN} for each in estimators),
-        *({"policy": each} for each in policies),
-    ]  # fmt: skip
-    played = choice.play([choice.plain, *(choice.labels("test", **each) for each in wanted)])
+    args.remark("[5/5] evaluate on test traffic, and over bandwidth and epsilon")
+    finalists = [*choice.finalists("estimator"), *choice.finalists("policy")]
+    wanted = [choice.tested, choice.plain, *({**each, "traffic": "test"} for each in finalists)]
+    played = choice.play([*{str(each): each for each in wanted}.values()])
     budgets = play_budgets(choice)
 
     keywords = chosen_keywords(choice, road)
@@ -228,7 +217,7 @@ def fit_road(args: Args, path: Path) -> None:
         {key: _in_file(path, value) for key, value in keywords.items()},
         dwell if "average_dwell" in road.assumed else None,
     )
-    said = [verdict(choice), *(f"- {note}" for note in choice.notes)]
+    said = [verdict(choice), *(f"- {each}" for each in (reason(choice), *choice.notes))]
     if changed:
         said.append(f"{path} has the table [environment] now; {copy} is as it was")
     said.append(f"{folder / PAGE} has the tables, and says what to do next")
@@ -252,11 +241,16 @@ def checked_road(args: Args, path: Path, folder: Path) -> Road:
 def as_json(
     choice: Choice, keywords: Mapping[str, Any], played: Sequence[Labels], budgets: Errors
 ) -> dict[str, Any]:
-    """Return what was chosen, and the errors x 1000 on each seed of test traffic."""
+    """Return what was chosen, and the errors x 1000 on each seed of validation and test traffic."""
+
+    def with_errors(of: Sequence[Labels]) -> list[Labels]:
+        return [{**each, "error": choice.errors(each).tolist()} for each in of]
+
     return {
         **{key: getattr(choice, key) for key in ("parameters", "estimator", "policy", "notes")},
         "environment": keywords,
-        "test": [{**each, "error": values(choice.rows, each, ERROR).tolist()} for each in played],
+        "validation": {what: with_errors(each) for what, each in choice.compared.items()},
+        "test": with_errors(played),
         "budgets": [
             {"bandwidth": bandwidth, "epsilon": epsilon, "error": errors.tolist()}
             for (bandwidth, epsilon), errors in budgets.items()
@@ -301,22 +295,41 @@ def keep(path: Path, fit: Fit, road: Road) -> None:
         write_parameters(temporary, fit.parameters, provenance)
 
 
+def estimators_tried(choice: Choice, args: Args, name: str) -> list[Labels]:
+    """Return the estimators with inherited and fitted parameters, and begin with what there is.
+
+    What the road file has already comes first, unless fitted parameters are kept in any case.
+    """
+    road, sets = choice.road, [name] if args.keep_fitted else [choice.home, name]
+    options: list[Labels] = [
+        {"estimator": estimator, "parameters": each}
+        for estimator in args.estimators or ESTIMATORS_TRIED
+        for each in dict.fromkeys(sets)
+    ]
+    choice.parameters = sets[0]
+    if road.present and not args.keep_fitted:
+        choice.sets[PRESENT] = dict(road.present)
+        choice.parameters = PRESENT
+        choice.estimator = str(road.present.get("estimator", road.config.estimator))
+        options.insert(0, {"estimator": choice.estimator, "parameters": PRESENT})
+    return options
+
+
 def note_parameters(choice: Choice, fit: Fit) -> None:
-    """Note what the fit of the parameters gave, after they were chosen on validation traffic."""
+    """Note what the fit of the parameters gave."""
     name = fit.parameters.name
     choice.notes.append(
         f"on training traffic the search took the error x 1000 of an EKF from {fit.start:.1f}, "
         f"with {fit.parameters.derived_from}, to {fit.error:.1f}"
     )
-    if choice.parameters != name:
-        errors = [
-            values(choice.rows, choice.labels("validation", parameters=each), ERROR).mean()
-            for each in (name, choice.parameters)
-        ]
+    own, other = (
+        choice.labels("validation", parameters=each) for each in (name, choice.parameters)
+    )
+    if choice.parameters != name and own in choice.compared["estimator"]:
         choice.notes.append(
-            f"the fitted parameters are not written: on validation traffic an EKF errs "
-            f"{errors[0]:.1f} with them and {errors[1]:.1f} with {choice.parameters}, which is no "
-            "certain gain; --keep-fitted writes them"
+            f"the fitted parameters are not written: on validation traffic {choice.estimator} errs "
+            f"{choice.errors(own).mean():.1f} with them and {choice.errors(other).mean():.1f} with "
+            f"{choice.parameters}, which is no certain gain; --keep-fitted writes them"
         )
     choice.notes += fit.at_bounds
 

@@ -10,7 +10,13 @@ from agents.fitting.choice import FEW, Choice, interval, is_less
 from agents.tables import ERROR, Labels, markdown, values
 from dptse_env.utils.arrays import FloatArray
 
-EPSILONS = (0.5, 1.0, 2.0, 5.0, 10.0)
+BANDWIDTHS = (1, 2, 5)
+"""Bandwidths of the table, beside that of the environment and all segments."""
+
+NO_NOISE = 1e4
+"""The largest epsilon that there is: as good as no noise."""
+
+EPSILONS = (0.5, 1.0, 5.0, NO_NOISE)
 """Privacy losses of the table, beside that of the environment."""
 
 SEEDS = 8
@@ -30,7 +36,7 @@ def play_budgets(choice: Choice) -> Errors:
     """
     config = choice.road.config
     n, own = config.corridor.geometry.n_mainline, config.privacy.epsilon
-    ladder = sorted({2**k for k in range(n.bit_length()) if 2**k < n} | {n, config.bandwidth})
+    ladder = sorted({*(each for each in BANDWIDTHS if each < n), n, config.bandwidth})
     wanted: dict[tuple[int, float], Labels] = {}
     for epsilon in sorted({*EPSILONS, own}):
         wanted[0, epsilon] = choice.labels("test", policy=NOTHING, epsilon=epsilon)
@@ -43,22 +49,38 @@ def play_budgets(choice: Choice) -> Errors:
 
 
 def budget_table(errors: Errors) -> str:
-    """Return a Markdown table of errors, a row for each bandwidth and a column for each epsilon."""
+    """Return a Markdown table of errors, a row for each bandwidth and a column for each epsilon.
+
+    The least error of a column is in bold.
+    """
     bandwidths, epsilons = (sorted({*each}) for each in zip(*errors, strict=True))
+    least = [_least(errors, epsilon) for epsilon in epsilons]
+
+    def entry(bandwidth: int, epsilon: float) -> str:
+        text = interval(errors.get((bandwidth, epsilon)))
+        return f"**{text}**" if (bandwidth, epsilon) in least else text
+
     return markdown(
-        ["bandwidth", *(f"ε = {epsilon:g}" for epsilon in epsilons)],
+        ["bandwidth", *map(_in_words, epsilons)],
         [
-            [
-                f"{bandwidth or 'no queries'}",
-                *(interval(errors.get((bandwidth, epsilon))) for epsilon in epsilons),
-            ]
+            [f"{bandwidth or 'no queries'}", *(entry(bandwidth, each) for each in epsilons)]
             for bandwidth in bandwidths
         ],
     )
 
 
+def _in_words(epsilon: float) -> str:
+    return "no noise" if epsilon == NO_NOISE else f"ε = {epsilon:g}"
+
+
+def _least(errors: Errors, epsilon: float) -> tuple[int, float]:
+    """Return the key of the smallest mean error at an epsilon."""
+    column = [key for key in errors if key[1] == epsilon]
+    return min(column, key=lambda key: float(errors[key].mean()))
+
+
 def advice(errors: Errors, own: float) -> str:
-    """Return where the error is least, and where queries stop paying, in sentences.
+    """Return what noise costs, and where queries stop paying, in sentences.
 
     Args:
         errors: What `play_budgets` gives.
@@ -66,26 +88,32 @@ def advice(errors: Errors, own: float) -> str:
     """
     queried = {key: each for key, each in errors.items() if key[0]}
     column = {bandwidth: each for (bandwidth, epsilon), each in queried.items() if epsilon == own}
-    bandwidth, epsilon = min(queried, key=lambda key: float(queried[key].mean()))
     best = min(column, key=lambda key: float(column[key].mean()))
     enough = min(key for key, each in column.items() if not is_less(column[best], each))
     certain = "certain " if len(column[best]) >= FEW else ""
     said = (
-        f"The error is least at bandwidth {bandwidth} and ε = {epsilon:g}. At the environment's "
-        f"ε = {own:g} it is least at bandwidth {best}; more than {enough} is no {certain}gain."
+        f"At the environment's {_in_words(own)} the error is least at bandwidth {best}; more than "
+        f"{enough} is no {certain}gain."
     )
+    columns = sorted({epsilon for _, epsilon in errors})
+    if columns[-1] == NO_NOISE and len(columns) > 1:
+        exact = float(errors[_least(errors, NO_NOISE)].mean())
+        costs = [
+            f"{100.0 * (float(errors[_least(errors, each)].mean()) / exact - 1.0):+.0f} % at "
+            f"{_in_words(each)}"
+            for each in columns[:-1]
+        ]
+        said += f" Noise costs {', '.join(costs)}: the least errors over that without noise."
     compared = sorted(epsilon for bandwidth, epsilon in errors if not bandwidth)
     idle = [
-        f"{epsilon:g}"
+        _in_words(epsilon)
         for epsilon in compared
         if not any(is_less(e, errors[0, epsilon]) for (_, k), e in queried.items() if k == epsilon)
     ]
     if not compared:
         said += " No episode without queries can be played here, to compare with."
     elif idle:
-        said += (
-            f" At ε = {', '.join(idle)} queries do not pay: they are no {certain}gain over none."
-        )
+        said += f" At {', '.join(idle)} queries do not pay: they are no {certain}gain over none."
     else:
         said += f" At each of these ε queries pay: some bandwidth is a {certain}gain over none."
     if len({each.tobytes() for (bandwidth, _), each in queried.items() if bandwidth == best}) == 1:

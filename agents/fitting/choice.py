@@ -1,7 +1,8 @@
 """Comparisons of a fit on validation traffic, its choices there, and its episodes on test traffic.
 
-Each choice is made with the one before it: the parameters with an EKF and round robin, the
-estimator with these parameters, the query policy with this estimator.
+Estimators are compared under round robin, each with inherited and with fitted parameters; then
+query policies with the chosen estimator; then the estimators again where another policy was chosen.
+So no estimator is proposed that loses to another one under the proposed policy.
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from dptse_env.utils.arrays import FloatArray
 
 NAME = "fit"
 FILTER, ROUND_ROBIN = "ekf", "round-robin"
-"""Estimator and query policy with which parameters are chosen."""
+"""Estimator and query policy with which parameters are fitted."""
 
 ESTIMATORS_TRIED = (
-    "asm", "blend", "ekf", "enkf", "mixture", "random_walk", "recurrent", "ukf",
+    "ekf", "random_walk", "asm", "blend", "ukf", "enkf", "mhe", "recurrent", "mixture",
 )  # fmt: skip
-"""Estimators among which a fit chooses: all that take less than a millisecond a second."""
+"""Estimators among which a fit chooses, the simplest first."""
 
 POLICIES_TRIED = (
     ROUND_ROBIN, "shift-ahead", "oldest-first", "largest-variance", "stale-variance",
     "largest-deviation", "speed-front", "expected-reduction",
 )  # fmt: skip
-"""Query policies among which it chooses."""
+"""Query policies among which it chooses, the simplest first."""
 
 NOISE = {"training": TUNING, "validation": CHOICE, "test": EVALUATION}
 """Seeds of the noise by kind of traffic."""
@@ -57,6 +58,8 @@ class Choice:
         parameters: The chosen set.
         estimator: The chosen estimator.
         policy: The chosen query policy.
+        compared: Labels of the estimators and of the policies that were compared last, by
+            ``"estimator"`` and ``"policy"``.
         rows: All rows so far.
     """
 
@@ -67,6 +70,7 @@ class Choice:
     parameters: str = ""
     estimator: str = FILTER
     policy: str = ROUND_ROBIN
+    compared: dict[str, list[Labels]] = field(default_factory=dict)
     rows: pl.DataFrame = field(default_factory=pl.DataFrame)
 
     @property
@@ -135,15 +139,43 @@ class Choice:
         self.rows = play_study(study, self.place)
         return [cell.labels for cell in cells.values()]
 
+    def errors(self, labels: Labels) -> FloatArray:
+        """Return the errors x 1000 of what was played, for each traffic seed."""
+        return values(self.rows, labels, ERROR)
+
     def best(self, played: Sequence[Labels]) -> Labels:
         """Return the labels of the smallest mean error."""
-        return min(played, key=lambda labels: float(values(self.rows, labels, ERROR).mean()))
+        return min(played, key=lambda labels: float(self.errors(labels).mean()))
 
-    def choose(self, options: Sequence[Labels]) -> None:
-        """Play changes of what is chosen on validation traffic, and choose the best one.
+    def unbeaten(self, played: Sequence[Labels]) -> list[Labels]:
+        """Return the labels of those that err certainly more than none of the others."""
+        errors = [self.errors(labels) for labels in played]
+        return [
+            labels
+            for labels, own in zip(played, errors, strict=True)
+            if not any(is_less(other, own) for other in errors)
+        ]
 
-        What is chosen stays unless the best one errs less with 95 % confidence, or the traffic has
-        too few seeds to tell.
+    def finalists(self, what: str) -> list[Labels]:
+        """Return what is chosen and the best of each other, where each has several parameters.
+
+        Args:
+            what: ``"estimator"`` or ``"policy"``.
+        """
+        found: dict[str, list[Labels]] = {}
+        for labels in self.compared[what]:
+            found.setdefault(labels[what], []).append(labels)
+        now = self.labels("validation")
+        return [now if now in each else self.best(each) for each in found.values()]
+
+    def choose(self, what: str, options: Sequence[Labels]) -> None:
+        """Play changes of what is chosen on validation traffic, and choose one that is unbeaten.
+
+        What is chosen stays if it is among them; else it is the first one.
+
+        Args:
+            what: ``"estimator"`` or ``"policy"``.
+            options: The changes, the simplest first.
 
         Raises:
             ValueError: The environment refuses all of them.
@@ -151,10 +183,11 @@ class Choice:
         played = self.play([self.labels("validation", **changes) for changes in options])
         if not played:
             raise ValueError(f"{self.road.path}: {self.notes[-1]}")
-        best, now = self.best(played), self.labels("validation")
-        if now not in played or is_less(*(values(self.rows, each, ERROR) for each in (best, now))):
+        self.compared[what] = played
+        unbeaten, now = self.unbeaten(played), self.labels("validation")
+        if now not in unbeaten:
             self.parameters, self.estimator, self.policy = (
-                best[key] for key in ("parameters", "estimator", "policy")
+                unbeaten[0][key] for key in ("parameters", "estimator", "policy")
             )
 
 

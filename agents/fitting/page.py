@@ -20,7 +20,7 @@ from agents.figures import (
     save_figure,
 )
 from agents.fitting.budget import SEEDS, Errors, advice, budget_table
-from agents.fitting.choice import Choice, interval
+from agents.fitting.choice import FEW, Choice, interval
 from agents.page import watch
 from agents.statistics import mean_interval
 from agents.tables import DENSITY, ERROR, SPEED, Labels, chi2, error_label, markdown, values
@@ -60,15 +60,17 @@ def write_page(
         f"# {road.corridor.name}",
         verdict(choice),
         f"{heading(road.env, cell.all_keywords)}.",
-        "Parameters, estimator and policy were chosen on validation traffic. All errors below are "
-        f"of test traffic, which was played once. {intervals} χ² is the mean square of errors over "
-        "reported deviations: 1 is honest.",
         "## Bandwidth and epsilon",
-        f"Error x 1000 of what was chosen, on {min(n, SEEDS)} of {n} episodes:",
+        f"Error x 1000 of what was chosen, on {min(n, SEEDS)} of {n} episodes of test traffic:",
         budget_table(budgets),
         advice(budgets, road.config.privacy.epsilon),
-        "## What was compared",
-        f"Plain is an EKF with {choice.home} and a round robin; what was chosen is in bold.",
+        "## Choices on validation traffic",
+        f"{capitalised(reason(choice))}. What was chosen is in bold.",
+        choice_table(choice, "estimator"),
+        choice_table(choice, "policy"),
+        "## Errors on test traffic",
+        f"Nothing was chosen on it. {intervals} χ² is the mean square of errors over reported "
+        f"deviations: 1 is honest. Plain is an EKF with {choice.home} and a round robin.",
         table(choice, played),
         "## Traffic",
         f"![Speeds over densities of a lane, and the curve of each set of parameters]({DIAGRAM})",
@@ -84,34 +86,85 @@ def write_page(
 
 def verdict(choice: Choice) -> str:
     """Return the result in two sentences."""
-    errors = [interval(values(choice.rows, each, ERROR)) for each in (choice.tested, choice.plain)]
+    errors = [interval(choice.errors(each)) for each in (choice.tested, choice.plain)]
     return (
         f"On {choice.road.corridor.name} take the estimator {choice.estimator} with the parameters "
         f"{choice.parameters}, and the query policy {choice.policy}: its error x 1000 on test "
         f"traffic is {errors[0]}, that of an EKF with the inherited parameters {choice.home} and a "
-        f"round robin {errors[1]} (difference {against(choice, choice.tested)})."
+        f"round robin {errors[1]} (difference {against(choice, choice.tested, choice.plain)})."
     )
 
 
-def against(choice: Choice, labels: Labels) -> str:
-    """Return by how many per cent a cell errs more than the plain one, paired by traffic."""
-    own, other = (values(choice.rows, each, ERROR) for each in (labels, choice.plain))
-    difference = 100.0 * (own - other) / other.mean()
-    if len(own) < 2:
+def reason(choice: Choice) -> str:
+    """Return why estimator and policy were chosen."""
+    n = len(choice.road.seeds["validation"])
+    by = "by the mean alone" if n < FEW else "with 95 % confidence"
+    said = []
+    for what, tables in choice.compared.items():
+        best, now = choice.best(tables), choice.labels("validation")
+        least = "" if best == now else f" ({_named(best, what)} has the least mean)"
+        said.append(f"no {what} errs less than {_named(now, what)}{least}")
+    episodes = f"{n} episode{'s' * (n > 1)}"
+    return (
+        f"on {episodes} of validation traffic {' and '.join(said)}, {by}; of equals what the "
+        "environment has stays, else the simplest is taken"
+    )
+
+
+def _named(labels: Labels, what: str) -> str:
+    parameters = f" with {labels['parameters']}" if what == "estimator" else ""
+    return f"{labels[what]}{parameters}"
+
+
+def capitalised(sentence: str) -> str:
+    """Return a sentence with a capital letter."""
+    return sentence[:1].upper() + sentence[1:]
+
+
+def against(choice: Choice, labels: Labels, other: Labels) -> str:
+    """Return by how many per cent a cell errs more than another one, paired by traffic."""
+    errors = choice.errors(other)
+    difference = 100.0 * (choice.errors(labels) - errors) / errors.mean()
+    if len(errors) < 2:
         return f"{difference[0]:+.1f} %"
     found = mean_interval(difference)
     return f"{found.mean:+.1f} ± {found.half_width:.1f} %"
 
 
+def choice_table(choice: Choice, what: str) -> str:
+    """Return a table of what was compared on validation traffic, the smallest error first."""
+    unbeaten, now = choice.unbeaten(choice.compared[what]), choice.labels("validation")
+    best, body = choice.best(choice.compared[what]), []
+    for labels in _sorted(choice, choice.finalists(what)):
+        name = f"**{labels[what]}**" if labels == now else labels[what]
+        body.append(
+            [
+                name,
+                *([labels["parameters"]] if what == "estimator" else []),
+                interval(choice.errors(labels)),
+                "-" if labels == best else against(choice, labels, best),
+                "no" if labels in unbeaten else "yes",
+                *(f"{each:.2f}" for each in chi2(choice.rows, labels)),
+            ]
+        )
+    parameters = ["parameters"] if what == "estimator" else []
+    more = "against the least", "beaten", "χ² density", "χ² speed"
+    return markdown([what, *parameters, error_label(ERROR), *more], body)
+
+
+def _sorted(choice: Choice, played: Sequence[Labels]) -> list[Labels]:
+    return sorted(played, key=lambda labels: float(choice.errors(labels).mean()))
+
+
 def table(choice: Choice, played: Sequence[Labels]) -> str:
     """Return a table of what was played on test traffic, the smallest error first."""
     body = []
-    for labels in sorted(played, key=lambda each: float(values(choice.rows, each, ERROR).mean())):
+    for labels in _sorted(choice, played):
         names = [labels[key] for key in ("parameters", "estimator", "policy")]
         if labels == choice.tested:
             names = [f"**{name}**" for name in names]
         errors = [interval(values(choice.rows, labels, each)) for each in (ERROR, DENSITY, SPEED)]
-        more = "-" if labels == choice.plain else against(choice, labels)
+        more = "-" if labels == choice.plain else against(choice, labels, choice.plain)
         honesty = [f"{each:.2f}" for each in chi2(choice.rows, labels)]
         body.append([*names, *errors, more, *honesty])
     head = "parameters", "estimator", "policy", *map(error_label, (ERROR, DENSITY, SPEED))

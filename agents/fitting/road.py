@@ -212,7 +212,7 @@ def _check_road(path: Path, corridor: Corridor) -> None:
             )
 
 
-USUAL = {"training": 8, "validation": 8, "test": 16}
+USUAL = {"training": 8, "validation": 16, "test": 16}
 """Traffic seeds of each kind on a road that is simulated."""
 
 
