@@ -269,20 +269,22 @@ class QueryProcess:
             return reward
         estimator, seconds, nobody = self.estimator, np.ones(len(episodes)), np.zeros_like(queried)
         told = estimator.innovations[episodes]
-        diverged, fallback = estimator.diverged[episodes], estimator.fallback[episodes]
+        flags = estimator.diverged, estimator.fallback, *self.release.flags
+        raised = [flag[episodes] for flag in flags]
         for _ in range(1, self.config.query_every):
             live = np.flatnonzero(~self.over[episodes])
             if live.size == 0:
                 break
             reward[live] += self._second(episodes[live], nobody[live])
             seconds[live] += 1.0
-            diverged |= estimator.diverged[episodes]
-            fallback |= estimator.fallback[episodes]
+            for own, flag in zip(raised, flags, strict=True):
+                np.maximum(own, flag[episodes], out=own)
         # What answers told is shown until the next decision; fixed sensors have told more since.
         answered = self.release.task.observed(queried) & ~self.release.task.observed(nobody)
         answered = answered[:, : told.shape[1], None]
         estimator.innovations[episodes] = np.where(answered, told, estimator.innovations[episodes])
-        estimator.diverged[episodes], estimator.fallback[episodes] = diverged, fallback
+        for own, flag in zip(raised, flags, strict=True):
+            flag[episodes] = own
         self.queried[episodes] = queried
         return reward / seconds
 

@@ -218,7 +218,7 @@ def test_a_mapping_of_settings_keeps_what_would_have_been_chosen():
 
 
 BAD_SETTINGS = [
-    ("ekf", "best", r" must be one of .*ekf-w99-3lane-printed.*, got 'best'$"),
+    ("ekf", "best", r" must be 'published' or one of .*ekf-w99-3lane-printed.*, got 'best'$"),
     ("ekf", {"noise": 1.0}, r"\.noise is unknown; allowed: "),
     ("ekf", {"mhe": {"horizon": 0}}, r"\.mhe\.horizon must be an integer in 1"),
     ("mhe", {"process_noise": [0.01, 0.0]}, r"\.process_noise\[1\] must be a finite number > 0"),

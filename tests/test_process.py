@@ -299,6 +299,22 @@ def test_a_second_that_diverges_is_flagged_for_its_whole_step():
     assert (process.info(0)["diverged"], len(added)) == (0.0, 8)
 
 
+def test_a_second_without_a_centre_is_flagged_for_its_whole_step():
+    process, asked = begun(2, privacy=PAID, query_every=4), []
+    predicted = process._predicted
+
+    def lost(episodes):
+        asked.append(episodes)
+        found = predicted(episodes)
+        return found._replace(density=np.nan * found.density) if len(asked) == 1 else found
+
+    process._predicted = lost
+    for told in (1.0, 0.0):
+        process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
+        assert [process.info(e)["centre_fallback"] for e in range(2)] == [told, 0.0]
+    assert len(asked) == 8
+
+
 def test_budgets_are_paced_for_queries_in_some_seconds():
     often, seldom = (make(1, privacy=PAID, query_every=every) for every in (1, 5))
     assert 1.0 < often.expected_sigma[0] / seldom.expected_sigma[0] < 5.0**0.5

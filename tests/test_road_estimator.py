@@ -141,6 +141,7 @@ def test_adaptive_smoothing_reaches_over_half_the_distance_of_stations():
     for keywords, reached in (
         ({}, 4),
         ({"stations": (0.0, 0.6)}, 6),
+        ({"stations": np.array([0.0, 0.6])}, 6),
         ({"stations": (0.0, 0.6), "estimator_settings": near}, 4),
     ):
         road = make("asm", **keywords)

@@ -15,7 +15,7 @@ from typing import Any
 
 from dptse_env.estimators.settings import PATH, EstimatorSettings
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
-from dptse_env.utils.registry import require_registered
+from dptse_env.utils.registry import require_registered_experts
 from dptse_env.utils.validation import check_object, cut, from_mapping, read_json, shown, within
 
 _KEYS = {"estimator": str, "settings": dict, "provenance": dict}
@@ -111,7 +111,7 @@ def load_settings(name: str) -> EstimatorSettings:
     """
     if name not in _table():
         known = ", ".join(available_settings())
-        raise ValueError(f"{PATH} must be one of {known}, got {shown(name)}")
+        raise ValueError(f"{PATH} must be {PUBLISHED!r} or one of {known}, got {shown(name)}")
     return _parse(_table()[name], name)
 
 
@@ -177,5 +177,5 @@ def _entry(content: Any, path: str) -> dict[str, Any]:
 def _parse(entry: Mapping[str, Any], path: str) -> EstimatorSettings:
     with within(f"{path}: "):
         found = from_mapping(EstimatorSettings, entry["settings"], PATH)
-        require_registered(list(found.mixture.experts or ()), f"{PATH}.mixture.experts")
+        require_registered_experts(entry["settings"], PATH)
     return found

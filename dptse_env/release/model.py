@@ -117,6 +117,14 @@ class ReleaseModel(ABC):
         unknown = np.full(len(steps), math.inf)
         return unknown, unknown.copy()
 
+    @property
+    def flags(self) -> tuple[FloatArray, ...]:
+        """Numbers in `public`, shape (n,) each, that are 1 where something happened in a second.
+
+        A step of several seconds tells of what happened in any of them.
+        """
+        return ()
+
     def report(self) -> PrivacyReport:
         """Return the privacy report; that of the base class claims no guarantee."""
         task, settings = self.task, self.task.settings

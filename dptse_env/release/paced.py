@@ -259,6 +259,11 @@ class Paced(ReleaseModel):
             "centre_fallback": self._fallback[episodes],
         }
 
+    @property
+    def flags(self) -> tuple[FloatArray, ...]:
+        """See `ReleaseModel.flags`: whether no prediction was finite."""
+        return (self._fallback,)
+
     def budgets_spent(self, episodes: IntArray) -> FloatArray:
         """See `ReleaseModel.budgets_spent`: payments over the budgets of all groups together."""
         if self.task.settings.unit == "event":

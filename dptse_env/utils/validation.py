@@ -129,15 +129,15 @@ def _field_hints(cls: Any) -> Mapping[str, Any]:
 
 
 def convert(hint: Any, value: Any, path: str, base: Any = None) -> Any:
-    """Return ``value``, which may be plain JSON, as the annotated type ``hint``.
+    """Return ``value``, which may be plain JSON or an array, as the annotated type ``hint``.
 
     A ``base`` of a dataclass has the values of fields that a mapping leaves out.
 
     Raises:
         ValueError: The value has the wrong type or range; the message starts with ``path``.
     """
-    if isinstance(value, np.generic):
-        value = value.item()
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
     kind, interval, origin, items = _parsed(hint)
     if kind is Any:
         return value

@@ -83,9 +83,10 @@ def test_shipped_sets_are_named_after_what_they_are_for():
         assert load_settings(name) != EstimatorSettings()
     with pytest.raises(
         ValueError,
-        match=r"^estimator_settings must be one of .*ekf-published-printed.*, got 'ekf'$",
+        match=r"^estimator_settings must be 'published' or one of .*ekf-published-printed.*, got "
+        r"'Published'$",
     ):
-        load_settings("ekf")
+        load_settings("Published")
 
 
 def test_a_written_set_reads_back_over_the_defaults(tmp_path):
