@@ -10,9 +10,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from dptse_env.config import KEYWORDS, PRESETS, EnvConfig
+from dptse_env.estimators.recurrent import weights_for
 from dptse_env.evaluation import require_in_step
 from dptse_env.privacy import rounded_up
 from dptse_env.registration import ENVIRONMENTS
@@ -103,11 +105,15 @@ CONDITIONS = {"demand", "incident"}
 """Keywords that change a road."""
 
 
-def heading(env: str, keywords: Mapping[str, Any]) -> str:
-    """Return an environment in words: its id and every condition that is not the id's default.
+NAMED = ("bandwidth", "query_every")
+"""Keywords that a heading names in any case."""
 
-    Parameters and the release model with its losses are named in any case. The estimator is left
-    to what stands below the heading.
+
+def heading(env: str, keywords: Mapping[str, Any]) -> str:
+    """Return an environment in words: what an error depends on, and all that is not its default.
+
+    Parameters, the release model with its losses, penetration, queries and sensors are named in any
+    case. The estimator is left to what stands below the heading; `settings_of` has its settings.
 
     Args:
         env: Id of the environment.
@@ -117,45 +123,65 @@ def heading(env: str, keywords: Mapping[str, Any]) -> str:
         config = make_config(env, keywords)
     default, privacy = PRESETS[preset_of(env)], config.privacy
     losses = f"epsilon {rounded_up(privacy.epsilon)}, delta {rounded_up(privacy.delta)}"
+    road, share = config.corridor, config.penetration.share
+    sensors = ", ".join(map(str, road.fixed_sensors))
     said = [
         env.rpartition("/")[2],
+        *([] if road.name == default.corridor.name else [f"road {road.name}"]),
         f"parameters {config.parameters.name}",
         f"release model {RELEASE_MODELS.name_of(privacy.preset)} ({losses})",
+        f"penetration {' to '.join(f'{each:g}' for each in np.atleast_1d(share))}",
+        *(f"{name} {getattr(config, name)}" for name in NAMED),
+        f"fixed sensors {sensors}" if sensors else "no fixed sensors",
+        str(road.loops or "no loops"),
     ]
-    road = config.corridor
-    if road.name != default.corridor.name:
-        sensors = ", ".join(map(str, road.fixed_sensors)) or "none"
-        said.insert(1, f"road {road.name} (fixed sensors {sensors})")
-        if keywords.keys() & CONDITIONS:
-            others = {name: value for name, value in keywords.items() if name not in CONDITIONS}
-            with quietly():
-                own = make_config(env, others).corridor
-            said += _differences("corridor", road.fields(), own.fields())
-    else:
-        said += _differences("corridor", road.fields(), default.corridor.fields())
-    if road.loops != default.corridor.loops:
-        said.append(str(road.loops or "no loops"))
+    own = default.corridor
+    if road.name != own.name:
+        others = {name: value for name, value in keywords.items() if name not in CONDITIONS}
+        with quietly():
+            own = make_config(env, others).corridor
+    said += _differences("corridor", road.fields(), own.fields())
     expected = RELEASE_MODELS.find(privacy.preset).settings_type(
         preset=privacy.preset, epsilon=privacy.epsilon, delta=privacy.delta
     )
     said += _differences("privacy", vars(privacy), vars(expected))
     for name in KEYWORDS:
-        if name not in ("corridor", "privacy", "parameters", "estimator", *INTERFACE):
-            own, other = getattr(config, name), getattr(default, name)
-            if dataclasses.is_dataclass(own) and type(own) is type(other):
-                said += _differences(name, vars(own), vars(other))
+        if name not in ("corridor", "privacy", "parameters", "estimator", *NAMED, *INTERFACE):
+            value, other = getattr(config, name), getattr(default, name)
+            if dataclasses.is_dataclass(value) and type(value) is type(other):
+                said += _differences(name, vars(value), vars(other))
             else:
-                said += _differences("", {name: own}, {name: other})
+                said += _differences("", {name: value}, {name: other})
     return ", ".join(said)
+
+
+def settings_of(env: str, keywords: Mapping[str, Any]) -> str:
+    """Return the estimator's settings in force in words: the name of a set, or of weights."""
+    with quietly():
+        config = make_config(env, keywords)
+    if config.settings_name is not None:
+        return config.settings_name
+    if config.estimator == "recurrent":
+        flows = config.release_model.centre(config.corridor, config.privacy) is not None
+        weights = config.settings().recurrent.weights
+        return f"weights {weights_for(weights, config.corridor.road, flows).source}"
+    if config.estimator_settings is None:
+        return "defaults"
+    given = keywords.get("estimator_settings", "those of the road file")
+    return given if isinstance(given, str) else "its own"
+
+
+ELSEWHERE = {"corridor.loops", "corridor.fixed_sensors", "penetration.share"}
+"""Values that a heading has in words of their own."""
 
 
 def _differences(path: str, own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """Return the values that differ from others, by path; of long ones the path alone."""
     found = []
     for name, value in own.items():
-        if name != "loops" and value != other.get(name):
+        place = f"{path}.{name}" if path else name
+        if place not in ELSEWHERE and value != other.get(name):
             words = getattr(value, "__name__", str(value))
-            place = f"{path}.{name}" if path else name
             found.append(f"{place} {words}" if len(words) <= LONGEST else f"another {place}")
     return found
 

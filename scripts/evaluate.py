@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 import polars as pl
 
-from agents.environments import heading, make_config, parse_env
+from agents.environments import heading, make_config, parse_env, settings_of
 from agents.figures import RoadMap, draw_errors, draw_maps, estimate_map, save_figure
 from agents.files import write_json
 from agents.page import watch, write_page
@@ -172,11 +172,18 @@ def compare(args: Args) -> None:
     draw_traffic(args, title, scores, cells)
     header, lines = make_rows(scores, args.reference)
     table = markdown([each.replace("\n", " ") for each in header], lines)
-    write_tables(args.output, f"# {title}\n\n{legend(seeds)}.\n\n{table}", rows)
+    settings = {
+        each.labels["estimator"]: settings_of(each.env, each.all_keywords) for each in cells
+    }
+    notes = f"{legend(seeds)}. Settings {in_force(settings)}"
+    write_tables(args.output, f"# {title}\n\n{notes}.\n\n{table}", rows)
     page = f", {PAGE} (for a browser)" if args.html else ""
     args.answer(
-        {"title": title, "reference": args.reference, "rows": [as_json(each) for each in scores]},
-        f"{title}\n{legend(seeds)}", make_table("", *header, left=2, rows=lines),
+        {
+            "title": title, "settings": settings, "reference": args.reference,
+            "rows": [as_json(each) for each in scores],
+        },
+        f"{title}\n{notes}", make_table("", *header, left=2, rows=lines),
         *verdicts(rows, scores, cells),
         f"wrote {args.output}/: {TABLES}, {ERRORS} (errors), {MAPS} (queries){page}",
     )  # fmt: skip
@@ -284,6 +291,11 @@ def legend(seeds: Sequence[int]) -> str:
     one = "One episode has no interval: differences may be chance"
     chi2 = "chi2 is the squared error over its reported variance, 1 of an honest estimator"
     return f"{several if len(seeds) > 1 else one}. {chi2}"
+
+
+def in_force(settings: Mapping[str, str]) -> str:
+    """Return the settings of estimators in words."""
+    return "; ".join(f"of {estimator}: {each}" for estimator, each in settings.items())
 
 
 def verdicts(rows: pl.DataFrame, scores: Sequence[Score], cells: Sequence[Cell]) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.environments import heading
+from agents.environments import heading, settings_of
 from agents.figures import (
     COLOURS,
     WIDTH,
@@ -59,7 +59,8 @@ def write_page(
     parts = [
         f"# {road.corridor.name}",
         verdict(choice),
-        f"{heading(road.env, cell.all_keywords)}.",
+        f"{heading(road.env, cell.all_keywords)}. Settings of {choice.estimator}: "
+        f"{settings_of(road.env, cell.all_keywords)}.",
         "## Bandwidth and epsilon",
         f"Error x 1000 of what was chosen, on {min(n, SEEDS)} of {n} episodes of test traffic:",
         budget_table(budgets),

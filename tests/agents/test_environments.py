@@ -2,7 +2,7 @@
 
 import pytest
 
-from agents.environments import heading, parse_env
+from agents.environments import heading, parse_env, settings_of
 from dptse_env.registration import ENVIRONMENTS
 
 PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
@@ -13,17 +13,23 @@ def headed(text):
     return heading(env, keywords)
 
 
-def test_the_heading_of_an_id_has_parameters_and_losses_alone():
-    model = "release model paced (epsilon 5, delta 0.05)"
-    assert headed(PRIVATE) == f"PrivateHighway-v1, parameters w99-3lane, {model}"
+def test_a_heading_names_what_is_in_force():
+    assert headed(PRIVATE) == (
+        "PrivateHighway-v1, parameters w99-3lane, release model paced (epsilon 5, delta 0.05), "
+        "penetration 1, bandwidth 5, query_every 1, fixed sensors 14, 17, 18, no loops"
+    )
 
 
 @pytest.mark.parametrize(
     ("keywords", "named"),
     [
         ('{"bandwidth": 1}', "bandwidth 1"),
-        ('{"penetration": 0.3}', "penetration.share 0.3"),
-        ('{"corridor": {"fixed_sensors": [0]}}', "corridor.fixed_sensors (0,)"),
+        ('{"query_every": 3}', "query_every 3"),
+        ('{"penetration": 0.3}', "penetration 0.3"),
+        ('{"penetration": [0.1, 0.3]}', "penetration 0.1 to 0.3"),
+        ('{"penetration": {"misreporting": 0.1}}', "penetration.misreporting 0.1"),
+        ('{"corridor": {"fixed_sensors": [0, 2]}}', "fixed sensors 0, 2"),
+        ('{"corridor": {"fixed_sensors": []}}', "no fixed sensors"),
         ('{"sensor_settings": {"absolute": 2}}', "sensor_settings.absolute 2.0"),
         ('{"reward": "density"}', "reward density"),
         ('{"epsilon": 1}', "release model paced (epsilon 1, delta 0.05)"),
@@ -41,18 +47,32 @@ def test_the_heading_of_an_id_has_parameters_and_losses_alone():
             "loops at 0.3 km every 20 s",
         ),
         ('{"demand": {"base": {"mainline": [[0, 900]]}}}', "another corridor.demand"),
-        (
-            '{"corridor": "short-highway", "bandwidth": 2}',
-            "road short-highway (fixed",
-        ),
+        ('{"corridor": "short-highway", "bandwidth": 2}', "road short-highway, parameters"),
         (
             '{"corridor": "short-highway", "bandwidth": 2, "incident": "none"}',
             "corridor.incident None",
         ),
     ],
 )
-def test_a_heading_names_what_differs(keywords, named):
-    assert f", {named}" in headed(f"{PRIVATE} {keywords}")
+def test_a_heading_names_each_condition(keywords, named):
+    said = headed(f"{PRIVATE} {keywords}")
+    assert f", {named}" in said
+    assert said.count(named) == 1
+
+
+@pytest.mark.parametrize(
+    ("keywords", "settings"),
+    [
+        ({}, "ekf-w99-3lane-paced"),
+        ({"estimator": "recurrent"}, "weights highway-flows"),
+        ({"estimator": "recurrent", "privacy": "corrected"}, "weights highway-speeds"),
+        ({"estimator": "asm"}, "defaults"),
+        ({"estimator_settings": "published"}, "ekf-w99-3lane-paced-published"),
+        ({"estimator_settings": {"noise_scale": [2.0, 2.0]}}, "its own"),
+    ],
+)
+def test_settings_in_force_have_a_name(keywords, settings):
+    assert settings_of(PRIVATE, keywords) == settings
 
 
 @pytest.mark.parametrize("env", ["nope", "CartPole-v1", "nope:dptse/ShortHighway-v0", ""])

@@ -116,8 +116,9 @@ def test_the_page_shows_choice_budgets_figures_and_commands(fitted):
     folder = path.parent / "my-road-fit"
     page = (folder / "fit.md").read_text(encoding="utf-8")
     assert all((folder / name).is_file() for name in re.findall(r"!\[.*\]\((.*)\)", page))
-    heading = "PrivateHighway-v1, road my-road (fixed sensors none), parameters"
-    for text in (heading, "bandwidth 1", "random_walk", "oldest-first", "dptse train"):
+    heading = "PrivateHighway-v1, road my-road, parameters "
+    force = "penetration 1, bandwidth 1, query_every 1, no fixed sensors, no loops. Settings of "
+    for text in (heading, force, "random_walk", "oldest-first", "dptse train"):
         assert text in page
     assert f"**{found['policy']}**" in page
     assert all(note in page for note in found["notes"])

@@ -45,7 +45,9 @@ def test_tables_rows_figures_and_json_agree(tmp_path):
         ("random_walk", name, seed) for name in ("none", "round-robin") for seed in (2000, 2001)
     }
     tables = (tmp_path / "out" / "tables.md").read_text("utf-8")
+    assert ". Settings of random_walk: random_walk-published-printed." in tables
     found = json.loads(run_command("evaluate", *words, "--force", "--json").stdout)
+    assert found["settings"] == {"random_walk": "random_walk-published-printed"}
     means = {}
     for row in found["rows"]:
         own = rows_of(tmp_path / "out", row["policy"])
@@ -219,7 +221,7 @@ def test_estimators_are_judged_on_a_measured_field(tmp_path):
     def means(epsilon):
         given = words(privacy="corrected", epsilon=epsilon, parameters="w99-3lane")
         found = json.loads(run_command(*given, "--output", tmp_path / f"{epsilon}").stdout)
-        assert found["title"].startswith("PaperHighway-v0, road road ")
+        assert found["title"].startswith("PaperHighway-v0, road road, ")
         assert "4 episodes on test traffic" in found["title"]
         return {row["estimator"]: row["means"] for row in found["rows"]}
 
@@ -254,7 +256,8 @@ def test_estimators_and_keywords_reach_the_environment():
     env = f'{SHORT} {{"privacy": {{"preset": "capped", "cap": 9}}, "bandwidth": 1}}'
     args = Args(env=env, policies=("random", "all"), estimators=("ukf", "ekf", "ukf"))
     title, cells = make_cells(args)
-    assert "privacy.cap 9, bandwidth 1" in title
+    for named in ("penetration 1, bandwidth 1, query_every 1, fixed sensors", "privacy.cap 9"):
+        assert named in title
     keywords = [cell.keywords for cell in cells]
     assert [each["estimator"] for each in keywords] == ["ukf"] * 3 + ["ekf"] * 3
     assert [each["bandwidth"] for each in keywords] == [1, 6, 1] * 2
