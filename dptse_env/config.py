@@ -233,6 +233,13 @@ class EnvConfig:
         """
         return checked_settings(self.estimator, self.settings_name or self.estimator_settings)
 
+    def made_for(self) -> Mapping[str, str]:
+        """Return settings that were made for other roads, traffic or releases, and for which."""
+        flows = self.release_model.centre(self.corridor, self.privacy) is not None
+        estimator: type[Estimator] = ESTIMATORS.find(self.estimator)
+        with within(self.origins.get("estimator_settings", "")):
+            return estimator.inherits(self.corridor.road, _played(self, flows), self.settings())
+
 
 # Readers ------------------------------------------------------------------------------------------
 #
@@ -655,12 +662,14 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
         values, assumed = {**table, **overrides, "corridor": road.corridor}, road.assumed
     _require_known(values, origins)
     config = EnvConfig(base, origins=origins, **values)
-    inherited = _inherited(config, values, assumed)
+    made_for = config.made_for()
+    inherited = (*_inherited(config, values, assumed), *made_for)
     if not inherited:
         return config
     warnings.warn(
         f"{', '.join(inherited)}: values measured or tuned on another road or with other "
-        "parameters, or assumed, or defaults that nobody tuned, are used; `dptse fit` fits "
+        "parameters, or assumed, or defaults that nobody tuned, are used; "
+        f"{''.join(f'{each}; ' for each in made_for.values())}`dptse fit` fits "
         "parameters to a road file, `dptse fit --tune` tunes settings",
         UserWarning,
         stacklevel=1,  # one place, so that Python tells it once, however environments are made
@@ -693,11 +702,6 @@ def _inherited(
     is_other = is_other_road or parameters != load_parameters(tuned_with(parameters))
     if given.get("estimator_settings") is None and _is_untuned(config, is_other):
         found.append("estimator_settings")
-    centre = config.release_model.centre(corridor, config.privacy)
-    estimator: type[Estimator] = ESTIMATORS.find(config.estimator)
-    played = _played(config, centre is not None)
-    with within(config.origins.get("estimator_settings", "")):
-        found += estimator.inherits(corridor.road, played, config.settings())
     return tuple(found)
 
 
@@ -721,7 +725,8 @@ def _played(config: EnvConfig, flows: bool) -> Played:
         for each in conditions.vehicle_classes
         if each.largest_speed is not None and each.largest_speed < limit
     ]
-    headways = [each.headway for each in (conditions.drivers, *(v.drivers for v in slow)) if each]
+    own = [each.drivers or conditions.drivers for each in conditions.vehicle_classes]
+    headways = [each.headway for each in own or [conditions.drivers]]
     loops = config.corridor.loops
     return {
         "flows": (flows,),

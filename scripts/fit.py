@@ -358,6 +358,7 @@ def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:
     said = {
         "parameters": f"the parameters {config.parameters.name} were fitted to another road",
         "estimator_settings": f"{settings}: dptse fit --tune makes settings of your own",
+        **config.made_for(),
     }
     return [said.get(key, f"{key} is of another road") for key in config.inherited]
 

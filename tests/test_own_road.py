@@ -2,12 +2,14 @@
 
 import dataclasses
 import warnings
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from dptse_env import RoadEstimator
 from dptse_env.config import resolve
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.estimators.tuned import load_settings, write_settings
@@ -76,21 +78,84 @@ def test_weights_on_a_road_unlike_those_of_their_training_are_named(road_file):
     assert gym.make(ID, estimator="recurrent").unwrapped.config.inherited == ()
 
 
-def test_traffic_and_noise_beyond_the_card_of_weights_are_named(tmp_path):
-    ranges = {"slow_share": [0.0, 0.2], "epsilon": [0.5, 20.0]}
-    settings = weights_settings(tmp_path, **ranges)
-    lorry = {"name": "lorry", "length": 12.0, "largest_speed": 85.0}
+def classes(share=0.1, speed=85.0, **lorry):
+    """Keywords of a road with cars and lorries."""
+    car = {"name": "car", "share": 1.0 - share}
+    lorry = {"name": "lorry", "share": share, "length": 12.0, "largest_speed": speed, **lorry}
+    return {"corridor": {"vehicle_classes": [car, lorry]}}
 
-    def inherited(share, epsilon):
-        classes = [{"name": "car", "share": 1.0 - share}, {**lorry, "share": share}]
-        keywords = {"corridor": {"vehicle_classes": classes}, "epsilon": epsilon}
-        env = gym.make(ID, estimator="recurrent", estimator_settings=settings, **keywords)
-        return env.unwrapped.config.inherited
 
-    assert inherited(0.1, 5.0) == ()
-    for share, epsilon in ((0.3, 5.0), (0.1, 100.0)):
-        with pytest.warns(UserWarning, match="recurrent.weights: values measured"):
-            assert inherited(share, epsilon) == ("estimator_settings.recurrent.weights",)
+KNOWN = {
+    "n_mainline": [6, 20], "segment_length": [0.1, 0.15], "speed_limit": [80.0, 110.0],
+    "lanes": [1, 6], "span": [1, 2], "flows": [1, 1], "epsilon": [0.5, 20.0],
+    "connected": [0.05, 1.0], "slow_share": [0.0, 0.2], "slow_speed": [80.0, 95.0],
+    "headway": [0.8, 2.0], "loop_interval": [10, 300],
+}  # fmt: skip
+"""Ranges on a card: all properties that one may name."""
+WITHIN = {**classes(0.2), "epsilon": 20.0, "penetration": [0.05, 0.2], "query_spans": [1, 2]}
+BEYOND = [
+    ("n_mainline", {"corridor": {"n_mainline": 25}}, "25"),
+    ("segment_length", {"corridor": {"segment_length": 0.2}}, "0.2"),
+    ("speed_limit", {"corridor": {"speed_limit": 120}}, "120"),
+    ("lanes", {"corridor": {"lanes": 7}}, "7"),
+    ("span", {"query_spans": [1, 3]}, "3"),
+    ("flows", {"privacy": "corrected"}, "0"),
+    ("epsilon", {"epsilon": 100.0}, "100"),
+    ("epsilon", {"epsilon": 0.1}, "0.1"),
+    ("connected", {"penetration": 0.02}, "0.02"),
+    ("connected", {"penetration": [0.02, 0.5]}, "0.02"),
+    ("slow_share", classes(0.3), "0.3"),
+    ("slow_speed", classes(speed=70.0), "70"),
+    ("headway", {"corridor": {"drivers": {"headway": 0.5}}}, "0.5"),
+    ("headway", classes(speed=None, drivers={"headway": 2.5}), "2.5"),
+    ("loop_interval", {"loops": {"positions": [0.3], "interval": 600}}, "600"),
+]
+
+
+def told_beyond(make):
+    """Return what a function makes, and its warnings that weights were trained on others."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        made = make()
+    return made, [str(w.message) for w in caught if "was trained on" in str(w.message)]
+
+
+@pytest.mark.parametrize("make", [gym.make, partial(gym.make_vec, num_envs=2)])
+@pytest.mark.parametrize(("name", "keywords", "value"), BEYOND)
+def test_what_lies_beyond_the_card_of_weights_is_told_once(make, name, keywords, value, tmp_path):
+    settings = weights_settings(tmp_path, **KNOWN)
+    given = {"estimator": "recurrent", "estimator_settings": settings, "traffic_seeds": [0]}
+    env, told = told_beyond(lambda: make(ID, **given, **keywords))
+    (said,) = told
+    low, high = KNOWN[name]
+    assert f"weights.safetensors was trained on {name} {low:g} to {high:g}, not {value};" in said
+    assert "estimator_settings.recurrent.weights" in env.unwrapped.config.inherited
+    env, told = told_beyond(lambda: make(ID, **given, **WITHIN))
+    assert (env.unwrapped.config.inherited, told) == ((), [])
+
+
+@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
+def test_of_several_environments_python_tells_once(mode, tmp_path):
+    settings = weights_settings(tmp_path, **KNOWN)
+    given = {"estimator": "recurrent", "estimator_settings": settings, "epsilon": 100.0}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        gym.make_vec(ID, num_envs=3, vectorization_mode=mode, traffic_seeds=[0], **given)
+    assert sum("epsilon 0.5 to 20, not 100" in str(each.message) for each in caught) == 1
+
+
+@pytest.mark.parametrize(("name", "keywords", "value"), BEYOND)
+def test_a_stream_beyond_the_card_of_weights_is_told_once(name, keywords, value, tmp_path):
+    if name in ("span", "epsilon", "connected"):
+        return  # of queries, which a stream has not
+    settings = weights_settings(tmp_path, **{**KNOWN, "flows": [int(name == "flows"), 1]})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        road = resolve("private-highway", {k: v for k, v in keywords.items() if k != "privacy"})
+    make = partial(RoadEstimator, road.corridor, "recurrent", estimator_settings=settings)
+    _, (said,) = told_beyond(make)
+    assert f"{name} " in said
+    assert f"not {value};" in said
 
 
 def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):

@@ -219,15 +219,15 @@ class Estimator(ABC):
         """
 
     @classmethod
-    def inherits(cls, road: Road, played: Played, settings: Any) -> tuple[str, ...]:
-        """Return the settings that were made for other roads, traffic or releases than these.
+    def inherits(cls, road: Road, played: Played, settings: Any) -> Mapping[str, str]:
+        """Return the settings that were made for other roads, traffic or releases, and for which.
 
         Args:
             road: The road.
             played: What is played on it.
             settings: The settings.
         """
-        return ()
+        return {}
 
     def reset(
         self, episodes: IntArray, states: FloatArray, generators: Sequence[np.random.Generator]

@@ -60,16 +60,17 @@ class Mixture(Estimator):
                 check_settings(kind, model, own)
 
     @classmethod
-    def inherits(cls, road: Road, played: Played, settings: EstimatorSettings) -> tuple[str, ...]:
+    def inherits(cls, road: Road, played: Played, settings: EstimatorSettings) -> dict[str, str]:
         """Return the setting of the experts where no weights were trained on such roads."""
         experts = _experts(settings, road, bool(played["flows"][0]))
         with within(f"{PATH}.mixture.experts: "):
             found = [
-                bool(kind.inherits(road, played, own))
+                kind.inherits(road, played, own).values()
                 for kind, own in experts
                 if issubclass(kind, Recurrent)
             ]
-        return ("estimator_settings.mixture.experts",) if found and all(found) else ()
+        known = "; ".join(each for reasons in found for each in reasons)
+        return {"estimator_settings.mixture.experts": known} if found and all(found) else {}
 
     @property
     def weights(self) -> FloatArray:

@@ -112,16 +112,21 @@ class Recurrent(SegmentEstimator):
         weights_for(settings.recurrent.weights, model.road, flows)
 
     @classmethod
-    def inherits(cls, road: Road, played: Played, settings: EstimatorSettings) -> tuple[str, ...]:
+    def inherits(cls, road: Road, played: Played, settings: EstimatorSettings) -> dict[str, str]:
         """Return the setting of the weights where their card does not name what is played."""
         saved = weights_for(settings.recurrent.weights, road, bool(played["flows"][0]))
-        return ("estimator_settings.recurrent.weights",) if outside(saved, road, played) else ()
+        beyond = ", ".join(
+            f"{name} {where}" for name, where in outside(saved, road, played).items()
+        )
+        known = f"{saved.source} was trained on {beyond}"
+        return {"estimator_settings.recurrent.weights": known} if beyond else {}
 
 
-def outside(saved: SavedWeights, road: Road, played: Played) -> list[str]:
+def outside(saved: SavedWeights, road: Road, played: Played) -> dict[str, str]:
     """Return the properties of a road, its traffic and releases that weights do not know.
 
-    Ranges that a card lacks hold for everything.
+    With each come its range and the first value beyond it. Ranges that a card lacks hold for
+    everything.
     """
     found: dict[str, Sequence[float]] = {
         "n_mainline": (road.n_mainline,),
@@ -130,11 +135,11 @@ def outside(saved: SavedWeights, road: Road, played: Played) -> list[str]:
         "lanes": road.lanes.tolist(),
         **played,
     }
-    return [
-        name
+    return {
+        name: f"{low:g} to {high:g}, not {value:g}"
         for name, (low, high) in saved.card["ranges"].items()
-        if not all(low <= value <= high for value in found.get(name, ()))
-    ]
+        for value in [each for each in found.get(name, ()) if not low <= each <= high][:1]
+    }
 
 
 @dataclass(frozen=True)

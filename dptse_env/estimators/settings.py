@@ -109,7 +109,7 @@ class RecurrentSettings(_Checked, path=f"{PATH}.recurrent"):
             stands for ``roads-flows`` or ``roads-speeds``. None takes ``highway`` or
             ``long-highway`` on roads like those of the package, which they were trained on, and
             ``roads`` on any other. Outside of the ranges on their card they are used with a
-            warning, and ``info["inherited"]`` names this setting.
+            warning that names these, and ``EnvConfig.inherited`` has this setting.
     """
 
     weights: str | None = None

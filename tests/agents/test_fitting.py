@@ -527,6 +527,20 @@ def test_a_measured_field_with_one_test_window_is_fitted(tmp_path):
     assert env.unwrapped.config.inherited == ("estimator_settings",)
 
 
+def test_a_fit_tells_once_on_which_roads_the_chosen_weights_were_trained(tmp_path):
+    path = tmp_path / "fast.toml"
+    path.write_text(ROAD.replace("speed_limit = 90", "speed_limit = 250").replace("= 4 ", "= 6 "))
+    words = "--trials", "1", "--estimators", "recurrent", "--policies", "round-robin"
+    done = run_command("fit", path, *BRIEF[:6], *words, "--workers", "1")
+    assert done.returncode == 0, done.stderr
+    known = "roads-flows was trained on speed_limit 60 to "
+    assert (done.stdout + done.stderr).count(known) == 1
+    page = (tmp_path / "fast-fit" / "fit.md").read_text(encoding="utf-8")
+    assert page.count(known) == 1
+    with pytest.warns(UserWarning, match=known):
+        gym.make(ID, corridor=str(path))
+
+
 def test_recordings_of_one_window_say_what_is_missing(tmp_path):
     path = import_field(tmp_path, 1)
     before = files_of(path.parent)
