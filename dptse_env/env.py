@@ -80,7 +80,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | ``action``     | space                      | meaning                                      |
     | :--            | :--                        | :--                                          |
     | ``mask``       | ``MultiBinary(G)``         | a flag per query; too many are cut in turn   |
-    | ``scores``     | ``Box(-1, 1, (G,))``       | the highest scores, as far as bandwidth goes |
+    | ``scores``     | ``Box(-1, 1, (G,))``       | the highest clipped scores; ties in rotation |
     | ``slots``      | ``MultiDiscrete([G] * B)`` | a query in each of B slots                   |
     | ``sequential`` | ``Discrete(G)``            | one query per action, see `action_masks`     |
 
@@ -265,17 +265,18 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
         return outcome.observation[0], reward, False, truncated, process.info(0)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return flags (G,) of the queries that may be picked next, for ``action="sequential"``.
+        """Return flags of the valid choices, shape (m,), as MaskablePPO of sb3-contrib wants them.
+
+        Under ``action="sequential"`` they are those of the queries that may be picked next, (G,);
+        else all are set. `dptse_env.spaces.actions.ActionEncoding.masks` has their order.
 
         Raises:
-            ValueError: A step takes one action only.
             gymnasium.error.ResetNeeded: No episode is running.
         """
-        self.interface.require_sequential()
         if self.process.over[0]:
             raise gym.error.ResetNeeded("no episode is running: call reset() first")
-        free: NDArray[np.bool_] = self._available()[0]
-        return free
+        masks: NDArray[np.bool_] = self._masks()[0]
+        return masks
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the episode so far as a picture over space and time, shape (height, width, 3).

@@ -117,9 +117,9 @@ class QueryEnvBase:
         """Return the guarantee of an episode, or what voids it, and the account behind it."""
         return self.process.privacy()
 
-    def _available(self) -> BoolArray:
-        """Return flags (n, G) of the options that may be picked next."""
-        return self.interface.actions.available(self.process.pending.picked)
+    def _masks(self) -> BoolArray:
+        """Return flags of the valid choices of the n episodes, shape (n, m)."""
+        return self.interface.actions.masks(self.process.pending.picked)
 
     def _drawn(self) -> NDArray[np.uint8] | None:
         """Return the picture of the episode so far; None, with a warning, without a render mode."""

@@ -30,7 +30,6 @@ from dptse_env.spaces.observations import ObservationEncoding
 from dptse_env.spaces.rewards import make_reward
 from dptse_env.traffic import RecordLibrary
 from dptse_env.utils.arrays import BoolArray, Observation
-from dptse_env.utils.registry import name_of_class
 
 
 @dataclass(frozen=True)
@@ -59,14 +58,6 @@ class QueryInterface:
         if "picked" not in self.observations.slices:
             return np.zeros((*observation.shape[:-1], self.queries.n_queries), dtype=bool)
         return self.observations.block(observation, "picked") > 0
-
-    def require_sequential(self) -> None:
-        """Raise ``ValueError`` unless an action picks one query, as for ``"sequential"``."""
-        if not self.actions.picks_one_by_one:
-            raise ValueError(
-                "action_masks() needs action='sequential' or another encoding that picks one "
-                f"query per action, got {name_of_class(self.actions)}"
-            )
 
 
 def make_interface(config: EnvConfig) -> QueryInterface:

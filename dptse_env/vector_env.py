@@ -233,15 +233,13 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         return Transition(self._observation.copy(), reward, truncated, final)
 
     def action_masks(self) -> BoolArray:
-        """Return flags of the queries that may be picked next, shape (n, G), for ``sequential``.
+        """Return flags of the valid choices, shape (n, m), as in the scalar environment.
 
         Raises:
-            ValueError: An action is not the pick of one query.
             gymnasium.error.ResetNeeded: An episode was never reset.
         """
-        self.interface.require_sequential()
         self._require_reset()
-        return self._available()
+        return self._masks()
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return the episode ``render_episode`` so far as the one picture of a tuple.

@@ -121,7 +121,7 @@ def test_queries_bring_the_estimate_nearer(estimator, spans):
         fixed = {"privacy": SumRelease, "horizon": 60, "action": "scores", "estimator": estimator}
         env = make_batch(8, **fixed, **keywords)
         env.reset(seed=3)
-        scores = np.zeros(env.action_space.shape, dtype=np.float32)
+        scores = np.linspace([1.0] * 8, 0.0, env.action_space.shape[1], axis=1, dtype=np.float32)
         rewards = [env.step(scores)[1] for _ in range(59)]
         return -np.mean(rewards)
 

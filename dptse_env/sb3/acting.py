@@ -143,6 +143,7 @@ class ActingPolicy:
         return self.policy.predict(observation, state, episode_start, deterministic, **extra)
 
     def _masks(self, observation: Observation) -> BoolArray:
-        """Return the queries that may be picked next, (G,) or (k, G)."""
+        """Return flags of the valid choices, (m,) or (k, m)."""
         picked = self.interface.picked(observation)
-        return self.interface.actions.available(np.atleast_2d(picked)).reshape(picked.shape)
+        masks = self.interface.actions.masks(np.atleast_2d(picked))
+        return masks.reshape(*picked.shape[:-1], -1)

@@ -29,8 +29,7 @@ class SB3VecEnv(VecEnv):
     info of the scalar environment at the end. For episodes that continue, ``infos[i]`` is empty.
     Numbers, seeds and options are those of ``DummyVecEnv`` over as many scalar environments.
 
-    ``env_method("action_masks")`` returns the masks of sequential actions, as MaskablePPO needs
-    them.
+    ``env_method("action_masks")`` returns the masks of actions, as MaskablePPO needs them.
 
     With ``replicas``, each group of that many consecutive episodes has the same traffic and noise
     at every second, whatever its episodes query, and ``seed(s)`` seeds group k with s + k; see
@@ -136,14 +135,10 @@ class SB3VecEnv(VecEnv):
         """Return an attribute as each of the scalar environments would return it.
 
         Raises:
-            AttributeError: There is none; `action_masks` exists for sequential actions only.
+            AttributeError: There is none.
         """
         episodes = list(self._get_indices(indices))
         if attr_name == _MASKS:
-            try:
-                self.env.interface.require_sequential()
-            except ValueError as problem:
-                raise AttributeError(str(problem)) from problem
             return [lambda e=e: self.env.action_masks()[e] for e in episodes]
         if attr_name in ("action_space", "observation_space"):
             return [getattr(self, attr_name)] * len(episodes)
@@ -164,17 +159,16 @@ class SB3VecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Return the masks of sequential actions, each of shape (n_queries,), for `action_masks`.
+        """Return the masks of actions, each of shape (m,), for `action_masks`.
 
         Raises:
-            AttributeError: The method is another one, or the actions are not sequential.
+            AttributeError: The method is another one.
         """
         if method_name != _MASKS:
             raise AttributeError(
                 f"env_method knows {_MASKS}, got {method_name!r}: the episodes share one "
                 "environment, use its methods"
             )
-        self.get_attr(_MASKS, indices)
         masks = self.env.action_masks()
         return [masks[e] for e in self._get_indices(indices)]
 

@@ -4,8 +4,8 @@ Every encoding turns a batch of actions into queries that the bandwidth pays for
 queries back into an action. The queries to choose from are the mainline segments, or, with other
 spans, those of `dptse_env.release.Queries`. An encoding holds its Gymnasium
 space, so the two cannot drift apart, and no state: the state between actions is part of the process
-(`PendingPicks`). Surplus requests are dropped, and missing ones added, from a rotating pointer that
-does not depend on the traffic.
+(`PendingPicks`). Surplus requests are dropped, missing ones added, and ties decided, from a
+rotating pointer that does not depend on the traffic.
 
 Any action that the space can sample is valid. A wrong shape, a wrong dtype, a NaN or an index
 beyond the queries raises ``ValueError``.
@@ -195,6 +195,21 @@ class ActionEncoding(ABC):
         free: BoolArray = ~picked & (self.costs <= left[:, None])
         return free
 
+    def masks(self, picked: BoolArray) -> BoolArray:
+        """Return flags of the valid choices of an action, shape (k, m), as sb3-contrib has them.
+
+        A ``Discrete`` has a flag for each value, a ``MultiDiscrete`` those of each of its numbers
+        in turn, a ``MultiBinary`` two for each of its flags. All are set, unless an action picks
+        one query: then they are those of `available`.
+
+        Args:
+            picked: Queries already chosen for this decision, shape (k, n_queries).
+        """
+        if self.picks_one_by_one:
+            return self.available(picked)
+        n_flags = 2 if isinstance(self.space, spaces.MultiBinary) else 1
+        return np.ones((len(picked), n_flags * spaces.flatdim(self.space)), dtype=bool)
+
     def completes(self, queried: BoolArray, picked: BoolArray) -> BoolArray:
         """Return whether the action of `encode` for the same arguments completes a decision."""
         n_actions = queried.sum(axis=1) if self.picks_one_by_one else 1
@@ -295,7 +310,8 @@ class MaskAction(ActionEncoding):
 class ScoresAction(ActionEncoding):
     """``Box(-1, 1, (n,))``: the queries of highest score, as many as the bandwidth pays for.
 
-    A query that costs more than is left is passed over. Ties go to the first query, upstream.
+    Scores beyond the bounds count as the bound. Ties are decided in rotation. A query that costs
+    more than is left is passed over.
     """
 
     def make_space(self) -> spaces.Space[Any]:
@@ -307,8 +323,15 @@ class ScoresAction(ActionEncoding):
         array = self._checked(episodes, actions)
         if array.dtype.kind != "f" or not np.isfinite(array).all():
             raise ValueError(f"action must hold finite floats, got {array.tolist()}")
-        order = np.argsort(-array, axis=1, kind="stable")
-        queried = first_that_fit(order, self.costs, self.bandwidth)
+        scores, n = np.clip(array, -1.0, 1.0), self.n_queries
+        turn = (np.arange(n) - pending.pointer[episodes, None]) % n
+        queried = first_that_fit(np.lexsort((turn, -scores)), self.costs, self.bandwidth)
+        # The pointer moves past what was taken of a tie, up to the first that has to wait.
+        waits = ~queried & (self.costs <= self.bandwidth)
+        is_tied = scores == np.where(waits, scores, -np.inf).max(axis=1, keepdims=True)
+        first = np.where(is_tied & waits, turn, n).min(axis=1, keepdims=True)
+        passed = np.where(is_tied & queried & (turn < first), turn + 1, 0).max(axis=1)
+        pending.pointer[episodes] = (pending.pointer[episodes] + passed) % n
         k = len(episodes)
         return Decision(queried, np.zeros(k, dtype=np.int64), np.ones(k, dtype=bool))
 

@@ -91,12 +91,51 @@ def test_rotation_serves_every_request(seed, bandwidth):
     assert ((served > 0) == (wanted > 0)).all()
 
 
-def test_scores_take_the_highest_that_fit_and_break_ties_upstream():
+def test_scores_take_the_highest_that_fit_and_break_ties_in_rotation():
+    played = Played(ScoresAction)
     scores = np.array([0.1, 0.9, -1, 0.9, 0.9, 0], np.float32)
-    assert indices(Played(ScoresAction).decode(scores)) == [1, 3]
+    assert [indices(played.decode(scores)) for _ in range(4)] == [[1, 3], [1, 4], [3, 4], [1, 3]]
+    played.decode(np.array([0.5, 0.9, 0.7, 0.9, 0.1, 0], np.float32))  # nothing to decide
+    assert indices(played.decode(scores)) == [1, 4]
+    played.pending.reset(FIRST)
+    assert indices(played.decode(scores)) == [1, 3]
+    assert indices(played.decode(np.float32([1, 0, 0, 0, 0, 0]))) == [0, 4]
     scores = np.array([0.1, 0.2, 0, 0, 0.7, 0.8, 0, 0.9], dtype=np.float32)
     for bandwidth, queried in ((4, [1, 7]), (5, [5, 7]), (2, [5])):
         assert indices(Played(ScoresAction, bandwidth, COSTS).decode(scores)) == queried
+
+
+def test_equal_scores_are_a_round_robin_also_where_costs_differ():
+    played = Played(ScoresAction)
+    found = [indices(played.decode(np.zeros(6, np.float32))) for _ in range(4)]
+    assert found == [[0, 1], [2, 3], [4, 5], [0, 1]]
+    played = Played(ScoresAction, 3, COSTS)
+    served = sum(played.decode(np.ones(8, np.float32)).queried[0].astype(int) for _ in range(9))
+    assert served.min() >= 1
+    played, scores = Played(ScoresAction, 3, COSTS), flags(4, 5) - 0.5 * flags(0, 1, 2, 3)
+    found = [indices(played.decode(scores)) for _ in range(3)]  # the rest of 1 goes to the next
+    assert [each[-1] for each in found] == [4, 5, 4]
+
+
+def test_scores_beyond_the_bounds_count_as_the_bounds():
+    beyond, clipped = Played(ScoresAction), Played(ScoresAction)
+    scores = np.array([3.0, -9.0, 1.0, 0.2, 7.0, 1.1])
+    for _ in range(5):
+        expected = clipped.decode(np.clip(scores, -1, 1))
+        assert indices(beyond.decode(scores)) == indices(expected)
+
+
+SIZES = [(MaskAction, 12), (ScoresAction, 6), (SlotsAction, 12), (SequentialAction, 6)]
+
+
+@pytest.mark.parametrize(("kind", "size"), SIZES)
+def test_masks_flag_all_choices_that_are_valid(kind, size):
+    """In the order of sb3-contrib, whose policies the tests of clients train with them."""
+    picked = np.zeros((3, 6), dtype=bool)
+    picked[1, 2] = kind is SequentialAction
+    masks = kind(queries(2, EQUAL)).masks(picked)
+    assert (masks.shape, masks.dtype) == ((3, size), bool)
+    assert np.argwhere(~masks).tolist() == ([[1, 2]] if kind is SequentialAction else [])
 
 
 def test_equal_costs_of_two_are_paid_for_while_the_bandwidth_lasts():
