@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from dptse_env.config import KEYWORDS, PRESETS, EnvConfig
 from dptse_env.estimators.recurrent import weights_for
 from dptse_env.evaluation import require_in_step
+from dptse_env.parts import privacy_report
 from dptse_env.privacy import rounded_up
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.release import RELEASE_MODELS
@@ -122,14 +123,13 @@ def heading(env: str, keywords: Mapping[str, Any]) -> str:
     with quietly():
         config = make_config(env, keywords)
     default, privacy = PRESETS[preset_of(env)], config.privacy
-    losses = f"epsilon {rounded_up(privacy.epsilon)}, delta {rounded_up(privacy.delta)}"
     road, share = config.corridor, config.penetration.share
     sensors = ", ".join(map(str, road.fixed_sensors))
     said = [
         env.rpartition("/")[2],
         *([] if road.name == default.corridor.name else [f"road {road.name}"]),
         f"parameters {config.parameters.name}",
-        f"release model {RELEASE_MODELS.name_of(privacy.preset)} ({losses})",
+        release_in_words(config),
         f"penetration {' to '.join(f'{each:g}' for each in np.atleast_1d(share))}",
         *(f"{name} {getattr(config, name)}" for name in NAMED),
         f"fixed sensors {sensors}" if sensors else "no fixed sensors",
@@ -153,6 +153,26 @@ def heading(env: str, keywords: Mapping[str, Any]) -> str:
             else:
                 said += _differences("", {name: value}, {name: other})
     return ", ".join(said)
+
+
+def release_in_words(config: EnvConfig) -> str:
+    """Return the release model of an environment, with epsilon and delta."""
+    privacy = config.privacy
+    losses = f"epsilon {rounded_up(privacy.epsilon)}, delta {rounded_up(privacy.delta)}"
+    return f"release model {RELEASE_MODELS.name_of(privacy.preset)} ({losses})"
+
+
+GUARANTEE = "guarantee"
+"""Column of what `guarantee_of` gives."""
+
+
+def guarantee_of(env: str, keywords: Mapping[str, Any]) -> str:
+    """Return epsilon and delta of an environment's guarantee for a table, or "none"."""
+    with quietly():
+        config = make_config(env, keywords)
+    if privacy_report(config).guarantee == "none":
+        return "none"
+    return f"ε = {rounded_up(config.privacy.epsilon)}, δ = {rounded_up(config.privacy.delta)}"
 
 
 def settings_of(env: str, keywords: Mapping[str, Any]) -> str:

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from agents.environments import make_config, parse_env, quietly
+from agents.environments import heading, make_config, parse_env, quietly
 from agents.executors import make_executor
 from agents.figures import save_figure
 from agents.files import check_plan, keep_plan
@@ -121,7 +121,9 @@ def tune_settings(args: Args) -> None:
     foreign = [f"{n}.json" for n, search in searches.items() if not search.is_begun(journal)]
     require_output(folder, foreign, force=args.force)
     columns = "set", "settings", "reward", "density RMSE\n[veh/km]", "speed RMSE\n[km/h]"
-    table, found = make_table("scores on the tuning traffic", *columns, left=2), {}
+    cell = next(iter(searches.values())).cell
+    title = f"{heading(cell.env, cell.keywords)}: scores on the tuning traffic"
+    table, found = make_table(title, *columns, left=2), {}
     executor = make_executor("local", args.workers or 1)
     for name, search in searches.items():
         args.library(search.config.corridor, search.seeds)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.environments import heading, settings_of
+from agents.environments import heading, release_in_words, settings_of
 from agents.figures import (
     COLOURS,
     WIDTH,
@@ -25,6 +25,7 @@ from agents.page import watch
 from agents.statistics import mean_interval
 from agents.tables import DENSITY, ERROR, SPEED, Labels, chi2, error_label, markdown, values
 from dptse_env.model import ARZParameters
+from dptse_env.privacy import rounded_up
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import write_atomically
 
@@ -62,7 +63,8 @@ def write_page(
         f"{heading(road.env, cell.all_keywords)}. Settings of {choice.estimator}: "
         f"{settings_of(road.env, cell.all_keywords)}.",
         "## Bandwidth and epsilon",
-        f"Error x 1000 of what was chosen, on {min(n, SEEDS)} of {n} episodes of test traffic:",
+        f"Error x 1000 of what was chosen, on {min(n, SEEDS)} of {n} episodes of test traffic, "
+        f"with δ = {rounded_up(road.config.privacy.delta)} and the same settings at each ε:",
         budget_table(budgets),
         advice(budgets, road.config.privacy.epsilon),
         "## Choices on validation traffic",
@@ -88,9 +90,11 @@ def write_page(
 def verdict(choice: Choice) -> str:
     """Return the result in two sentences."""
     errors = [interval(choice.errors(each)) for each in (choice.tested, choice.plain)]
+    road = choice.road
     return (
-        f"On {choice.road.corridor.name} take the estimator {choice.estimator} with the parameters "
-        f"{choice.parameters}, and the query policy {choice.policy}: its error x 1000 on test "
+        f"On {road.corridor.name}, {release_in_words(road.config)}, take the estimator "
+        f"{choice.estimator} with the parameters {choice.parameters}, and the query policy "
+        f"{choice.policy}: its error x 1000 on test "
         f"traffic is {errors[0]}, that of an EKF with the inherited parameters {choice.home} and a "
         f"round robin {errors[1]} (difference {against(choice, choice.tested, choice.plain)})."
     )

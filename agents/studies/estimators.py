@@ -18,7 +18,14 @@ from typing import Any
 import polars as pl
 from matplotlib.figure import Figure
 
-from agents.environments import OTHER_DRIVERS, PAPER, PRIVATE, SHORT
+from agents.environments import (
+    GUARANTEE,
+    OTHER_DRIVERS,
+    PAPER,
+    PRIVATE,
+    SHORT,
+    guarantee_of,
+)
 from agents.figures import (
     ERROR_TICKS,
     LABELS,
@@ -82,6 +89,7 @@ ELSEWHERE: dict[str, World] = {
 }
 """Worlds that differ from PrivateHighway-v1 in one thing, and ShortHighway-v0; other roads and
 drivers are in the study of roads."""
+ALL_WORLDS = {**WORLDS, **ELSEWHERE}
 MOVED = (EKF, WALK, SMOOTHING, LEARNED)
 MOVED_SEEDS = SEEDS[:24]
 
@@ -94,7 +102,7 @@ def in_world(world: str, estimator: str = LEARNED) -> Labels:
 
 def world_cell(world: str, estimator: str) -> Cell:
     """Return the cell of an estimator in a world."""
-    env, changes = {**WORLDS, **ELSEWHERE}[world]
+    env, changes = ALL_WORLDS[world]
     keywords = {**changes, "estimator": estimator}
     if estimator == LEARNED:
         keywords["estimator_settings"] = {"recurrent": {"weights": "highway"}}
@@ -258,6 +266,7 @@ def world_tables(rows: pl.DataFrame) -> list[str]:
 
     parts = ["# Every vehicle answers", WORLD_NOTES, "![Errors](fig_estimators.png)"]
     columns: dict[str, Callable[[Any], str]] = {
+        GUARANTEE: lambda c: guarantee_of(*ALL_WORLDS[c["world"]]),
         "error x 1000": error,
         "below EKF [%]": gain,
         "density [veh/km]": lambda c: format_interval(mean(rows, c, DENSITY)),
@@ -265,7 +274,8 @@ def world_tables(rows: pl.DataFrame) -> list[str]:
         "χ²": partial(chi2_text, rows),
     }
     parts.append(table("", lines_of(WORLDS, EVERYONE, in_world), columns))
-    columns = {LABELS[each]: partial(error, estimator=each) for each in MOVED}
+    columns = {GUARANTEE: columns[GUARANTEE]}
+    columns |= {LABELS[each]: partial(error, estimator=each) for each in MOVED}
     columns |= {"recurrent below EKF [%]": gain, "χ² of recurrent": partial(chi2_text, rows)}
     moved = {world: in_world(world) for world in ELSEWHERE}
     parts += ["## Away from the training", MOVED_NOTES, "![Gains](fig_elsewhere.png)"]
@@ -295,8 +305,13 @@ def sensed_tables(rows: pl.DataFrame) -> list[str]:
     def of_share(share: float, pair: Pair) -> str:
         return gain(sensed(*pair, share), alone(*pair))
 
+    def guarantee(pair: Pair) -> str:
+        release, _ = pair
+        return guarantee_of(PRIVATE, {"privacy": release, "epsilon": EPSILON})
+
     everyone = lines_of(RELEASES, ESTIMATORS, lambda *pair: pair)
     columns: dict[str, Callable[[Pair], str]] = {
+        GUARANTEE: guarantee,
         "both, error x 1000": lambda c: error(sensed(*c)),
         "below queries alone": lambda c: gain(sensed(*c), sensed(*c, sensors=QUERIES)),
         "below fixed sensors alone": lambda c: gain(sensed(*c), alone(*c, PART)),
@@ -304,7 +319,8 @@ def sensed_tables(rows: pl.DataFrame) -> list[str]:
     }
     parts = ["# A share of the vehicles answers", SENSED_NOTES, "![Errors](fig_arms.png)"]
     parts += [f"## Both or either alone, p = {BASE_SHARE:g}", table("", everyone, columns)]
-    columns = {name: partial(of_share, share) for name, share in SHARES.items()}
+    columns = {GUARANTEE: guarantee}
+    columns |= {name: partial(of_share, share) for name, share in SHARES.items()}
     title = "## Both below fixed sensors with the whole budget"
     return [*parts, title, table("", everyone, columns)]
 
@@ -339,7 +355,8 @@ def loop_table(rows: pl.DataFrame) -> list[str]:
         for interval in (0, *LOOP_INTERVALS)
     }
     columns["χ², every 60 s"] = lambda c: chi2_text(rows, {**c, "interval": 60})
-    return ["# Loops", LOOP_NOTES, table("", lines, columns)]
+    title = f"# Loops, {guarantee_of(PRIVATE, {})}"
+    return [title, LOOP_NOTES, table("", lines, columns)]
 
 
 # ---- Figures. ----
@@ -387,9 +404,18 @@ def draw_arms(rows: pl.DataFrame) -> Figure:
 
 
 FIGURES = {
-    "fig_estimators.png": (draw_worlds, "Error x 1000 of the estimate under a round robin"),
-    "fig_elsewhere.png": (draw_elsewhere, "The recurrent network away from PrivateHighway-v1"),
-    "fig_arms.png": (draw_arms, "Queries and fixed sensors together, and either alone"),
+    "fig_estimators.png": (
+        draw_worlds,
+        f"Error x 1000 under a round robin, PrivateHighway-v1 at ε = {EPSILON:g}",
+    ),
+    "fig_elsewhere.png": (
+        draw_elsewhere,
+        f"The recurrent network away from PrivateHighway-v1, at ε = {EPSILON:g} unless named",
+    ),
+    "fig_arms.png": (
+        draw_arms,
+        f"Queries and fixed sensors together, and either alone, at ε = {EPSILON:g}",
+    ),
 }
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-from agents.environments import PRIVATE
+from agents.environments import GUARANTEE, PRIVATE, guarantee_of
 from agents.figures import (
     ERROR_TICKS,
     LABELS,
@@ -267,30 +267,30 @@ def compared(ask: Ask, reference: str, lines: Mapping[str, tuple[Cell, Cell]], *
     """Return a table of both errors of cells, each against another cell, and of more columns."""
     found = []
     for name, (own, base) in lines.items():
-        line = [name]
+        line = [name, ask(GUARANTEE, own)]
         for metric in METRICS:
             line += [ask(metric, own), "-" if own == base else ask(metric, own, base)]
         found.append([*line, *(ask(column, own) for column in more)])
     header = chain.from_iterable((name, f"against {reference}") for name in ERRORS.values())
-    return markdown(["", *header, *more], found)
+    return markdown(["", GUARANTEE, *header, *more], found)
 
 
 def price_tables(ask: Ask) -> Iterator[str]:
     """Yield the tables of the part ``privacy``, each below its title."""
     for name, (metric, error) in product(ESTIMATORS, ERRORS.items()):
-        yield f"## {LABELS[name]}: {error} against ε"
+        yield f"## {LABELS[name]}: {error} against ε, δ = {DELTA:g}"
         makers = {each: partial(priced, name, each) for each in PROTECTIONS}
         lines: dict[str, Line] = {each: (metric, make) for each, make in makers.items()}
         for noise in SPEEDS:
             lines[f"{TRIP} − {noise}"] = metric, makers[TRIP], makers[noise]
         yield sweep(ask, "protection", along(EPSILONS), lines)
-    yield "## Boundary inputs, ε = 5"
+    yield "## Boundary inputs"
     boundaries = {
         f"{LABELS[name]}, {each}": (priced(name, boundary=each), priced(name))
         for name, each in product((*ESTIMATORS, "open_loop"), BOUNDARIES)
     }
     yield compared(ask, "nominal", boundaries)
-    yield "## Bandwidth, ε = 5"
+    yield "## Bandwidth"
     bandwidths = {
         f"{LABELS[name]}, {each} a second": (priced(name, bandwidth=each), priced(name))
         for name, each in product(ESTIMATORS, BANDWIDTHS)
@@ -321,7 +321,7 @@ def ledger_tables(ask: Ask) -> Iterator[str]:
         lines[f"{name}: `paced` − `capped`"] = column, paid, capped
     yield f"## Errors against ε, δ = {DELTA:g}"
     yield sweep(ask, "", along(CURVE), lines)
-    yield "## What is protected"
+    yield f"## What is protected, ε = {SETTINGS['epsilon']:g}, δ = {DELTA:g}"
     yield sweep(ask, "", VARIANTS, lines)
 
 
@@ -338,7 +338,12 @@ def all_cells() -> tuple[Cell, ...]:
 
 
 def number(rows: pl.DataFrame, column: str, own: Cell, base: Cell | None = None) -> str:
-    """Return the mean of a column of a cell, or by how much it exceeds that of another, paired."""
+    """Return the mean of a column of a cell, or by how much it exceeds that of another, paired.
+
+    `GUARANTEE` is what a cell has whether it was played or not.
+    """
+    if column == GUARANTEE:
+        return guarantee_of(own.env, own.keywords)
     if base is None:
         return format_interval(mean(rows, own.labels, column))
     return format_interval(difference(rows, own.labels, base.labels, column))

@@ -22,7 +22,7 @@ import numpy as np
 import polars as pl
 from scipy import stats
 
-from agents.environments import LONG, PAPER, PRIVATE, SHORT
+from agents.environments import GUARANTEE, LONG, PAPER, PRIVATE, SHORT, guarantee_of
 from agents.figures import GREY, finish_figure, make_figure, save_figure
 from agents.play import Cell
 from agents.policies import find_policy, policy_name
@@ -124,6 +124,11 @@ RULES = (
 )  # fmt: skip
 """Schedules that do without the truth."""
 ORACLES = ("oracle-error", ONE)
+
+
+def guarantee(name: str) -> str:
+    """Return the guarantee of a cell, see `agents.environments.guarantee_of`."""
+    return guarantee_of(CELLS[name].env, CELLS[name].keywords)
 
 
 def make_cell(name: str, policy: str, source: str) -> Cell:
@@ -309,13 +314,14 @@ def beside_rules(rows: pl.DataFrame, policies: Sequence[str]) -> tuple[list[str]
     lines = [
         [
             name,
+            guarantee(name) if name in CELLS else "-",
             *(columns[policy][name] for policy in policies),
             cell(best, name),
             cell(lambda name: tenths(room(rows, name)), name),
         ]
         for name in names
     ]
-    return ["cell", *policies, "best rule", f"{ONE} below it [%]"], lines
+    return ["cell", GUARANTEE, *policies, "best rule", f"{ONE} below it [%]"], lines
 
 
 def room(rows: pl.DataFrame, name: str) -> Interval:
@@ -416,21 +422,21 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     rows = _present(rows)
     scores = score_all(rows)
     draw_scores(scores, folder / FIGURE)
-    header = ["policy", "mean", *(f"`{name}`" for name in CELLS)]
+    heads = {f"`{name}`, {guarantee(name)}".removesuffix(", none"): name for name in CELLS}
     lines = [[f"`{policy}`", *format_scores(each)] for policy, each in scores.items()]
     return "\n\n".join(
         [
             f"# {NAME}",
             "## Scores",
-            markdown(header, lines),
+            markdown(["policy", "mean", *heads], lines),
             "## What is to be won",
             markdown(*beside_rules(rows, ())),
             "## Errors x 1000",
             grid(
                 "policy",
                 list(scores),
-                list(CELLS),
-                lambda policy, name: f"{mean(rows, _labels(policy, name), ERROR).mean:.1f}",
+                list(heads),
+                lambda policy, head: f"{mean(rows, _labels(policy, heads[head]), ERROR).mean:.1f}",
             ),
             "## Cells",
             _cell_table(),
@@ -443,11 +449,12 @@ def _cell_table() -> str:
         [
             f"`{name}`",
             f"`{each.env.rpartition('/')[2]} {json.dumps(each.keywords)}`",
+            guarantee(name),
             format_range(each.seeds or ()),
         ]
         for name, each in CELLS.items()
     ]
-    return markdown(["cell", "environment", "traffic seeds"], lines)
+    return markdown(["cell", "environment", GUARANTEE, "traffic seeds"], lines)
 
 
 _LEAST = -0.5

@@ -25,7 +25,7 @@ import polars as pl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agents.environments import LONG, PAPER, PRIVATE, SHORT
+from agents.environments import GUARANTEE, LONG, PAPER, PRIVATE, SHORT, guarantee_of
 from agents.figures import (
     COLOURS,
     GREY,
@@ -117,7 +117,7 @@ class Setting(NamedTuple):
     """An environment in which policies are compared.
 
     Attributes:
-        description: What it is, in tables.
+        description: What it is, without its guarantee.
         env: Environment id.
         keywords: Keywords of the environment.
         traffic: Traffic seeds.
@@ -129,6 +129,16 @@ class Setting(NamedTuple):
     keywords: Mapping[str, Any]
     traffic: Traffic = TRAFFIC
     changes: Mapping[str, Mapping[str, Any]] = CHANGES
+
+    @property
+    def guarantee(self) -> str:
+        """Its guarantee, see `agents.environments.guarantee_of`."""
+        return guarantee_of(self.env, self.keywords)
+
+    @property
+    def title(self) -> str:
+        """What it is, with its guarantee, if it has one."""
+        return f"{self.description}, {self.guarantee}".removesuffix(", none")
 
 
 _ONE, _TWO = ({"estimator": "ekf", "bandwidth": bandwidth} for bandwidth in (1, 2))
@@ -315,6 +325,7 @@ def summary_table(rows: pl.DataFrame, curves: pl.DataFrame) -> str:
         return f"`{folder.as_posix()}`"
 
     columns: dict[str, Callable[[str], str]] = {
+        GUARANTEE: lambda name: SETTINGS[name].guarantee,
         ROUND_ROBIN: partial(error, ROUND_ROBIN),
         "best rule": rule,
         ORACLE: partial(error, ORACLE),
@@ -350,7 +361,7 @@ def _panels(titles: Iterable[str], label: str = "", **options: Any) -> tuple[Fig
     for axis in axes[len(named) :]:
         axis.remove()
     for axis, title in zip(axes, named, strict=False):
-        axis.set_title(title, fontsize=9)
+        axis.set_title(title, fontsize=7)
     for axis in axes[::2]:
         axis.set_ylabel(label, fontsize=8)
     return figure, axes[: len(named)]
@@ -358,7 +369,7 @@ def _panels(titles: Iterable[str], label: str = "", **options: Any) -> tuple[Fig
 
 def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
     """Draw errors in validation over the time of training, with rules as lines."""
-    figure, axes = _panels((each.description for each in SETTINGS.values()), "error x 1000")
+    figure, axes = _panels((each.title for each in SETTINGS.values()), "error x 1000")
     for axis, name in zip(axes, SETTINGS, strict=True):
         try:
             named = (ROUND_ROBIN, best_rule(rows, name))
@@ -380,7 +391,7 @@ def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
 
 def draw_below(rows: pl.DataFrame, path: Path) -> None:
     """Draw how far learners, shipped policies and oracles lie below the best rule."""
-    figure, axes = _panels((each.description for each in SETTINGS.values()), sharey=True)
+    figure, axes = _panels((each.title for each in SETTINGS.values()), sharey=True)
     for axis, name in zip(axes, SETTINGS, strict=True):
         looks = {
             **dict.fromkeys(SHOWN, (COLOURS[0], "learners, a minute")),
@@ -405,6 +416,7 @@ def draw_below(rows: pl.DataFrame, path: Path) -> None:
 
 CHOICES, LEARNED = "choices", "learned"
 HIGHWAY = "highway"
+EPSILON = 5.0
 N_SEGMENTS = {HIGHWAY: 15, "long": 120}
 BANDWIDTHS = {HIGHWAY: (1, 2, 3, 5, 8, 12), "long": (2, 4, 8, 24)}
 
@@ -420,7 +432,7 @@ class World(NamedTuple):
     def name(self) -> str:
         """Its name."""
         n = N_SEGMENTS[self.road]
-        return f"{n} segments, {self.release}, {LABELS[self.estimator]}"
+        return f"{n} segments, {self.release}, ε = {EPSILON:g}, {LABELS[self.estimator]}"
 
     @property
     def rule(self) -> str:
@@ -431,7 +443,7 @@ class World(NamedTuple):
         """Return how far a policy lies below the round robin [%]."""
         place = {
             "part": CHOICES, **self._asdict(), "bandwidth": bandwidth, "traffic": "own",
-            "epsilon": 5.0, "span": 1,
+            "epsilon": EPSILON, "span": 1,
         }  # fmt: skip
         both = ({**place, "policy": each} for each in (policy, ROUND_ROBIN))
         return measure(rows, percent_below, *both)
@@ -494,7 +506,7 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     if not rows.filter(part=TEST).is_empty():
         parts += ["## Summary", summary_table(rows, curves)]
         for name, setting in SETTINGS.items():
-            parts += [f"## {name}: {setting.description}", setting_table(rows, curves, name)]
+            parts += [f"## {name}: {setting.title}", setting_table(rows, curves, name)]
         draw_curves(rows, curves, folder / "fig_curves.png")
         draw_below(rows, folder / "fig_below.png")
     if not rows.filter(part=CHOICES).is_empty():

@@ -23,7 +23,7 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-from agents.environments import LONG, PAPER, PRIVATE
+from agents.environments import GUARANTEE, LONG, PAPER, PRIVATE, guarantee_of
 from agents.figures import LABELS, draw_errors, save_measured
 from agents.play import Cell
 from agents.statistics import Interval
@@ -256,6 +256,7 @@ def table_of(rows: pl.DataFrame, learned: Learned, roads: Iterable[str] = (*OWN,
         return f"{errors[0] / errors[1]:.2f}"
 
     columns: dict[str, Callable[[tuple[str, str]], str]] = {
+        GUARANTEE: lambda line: guarantee_of(PRIVATE, RELEASES[line[1]]),
         **{LABELS[name]: partial(error, name) for name in (*filters, own)},
         "below best filter [%]": lambda line: tenths(gain(rows, learned, *line)),
         **{f"χ² of {LABELS[name]}": partial(honesty, name) for name in (filters[-1], own)},
@@ -320,8 +321,8 @@ def draw_gains(rows: pl.DataFrame) -> Figure:
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return a table for each estimator with weights, and draw the gains of `recurrent`."""
-    title = "Error of the recurrent network below that of the best filter, 95 % intervals"
-    save_measured(folder / "fig_roads.png", title, draw_gains, rows)
+    title = f"The network below the best filter, {PACED} at ε = {RELEASES[PACED]['epsilon']:g}"
+    save_measured(folder / "fig_roads.png", f"{title}, 95 % intervals", draw_gains, rows)
     parts = ["# Roads that nobody trained on", NOTES, "![Gains](fig_roads.png)"]
     for each in learned_in(rows):
         parts += [f"## {each}", cell(summary, rows, each), table_of(rows, each)]

@@ -33,12 +33,13 @@ def test_tables_have_the_numbers_of_the_rows_and_dashes_for_the_rest(some):
     ekf, network = (world.filter(estimator=name) for name in ("ekf", "recurrent"))
     reward = network["reward"].mean()
     error, gain = -1000.0 * reward, 100.0 * (1.0 - reward / ekf["reward"].mean())
-    start = f"| PrivateHighway-v1, recurrent | {error:.1f} ["
-    (line,) = [x for x in lines if x.startswith(start) and x.count("|") == 7]
+    start = f"| PrivateHighway-v1, recurrent | ε = 5, δ = 0.05 | {error:.1f} ["
+    (line,) = [x for x in lines if x.startswith(start) and x.count("|") == 8]
     assert f"] | {gain:.2f} [" in line
     assert f" | {network['chi2_density'].mean():.2f}, {network['chi2_speed'].mean():.2f} |" in line
-    assert "| PrivateHighway-v1, UKF | - | - | - | - | - |" in lines
-    assert "| paced, EKF | - | - | - | - | - |" in lines
+    assert "| PrivateHighway-v1, UKF | ε = 5, δ = 0.05 | - | - | - | - | - |" in lines
+    assert "| PaperHighway-v0, corrected, UKF | none | - | - | - | - | - |" in lines
+    assert "| paced, EKF | ε = 5, δ = 0.05 | - | - | - | - | - |" in lines
 
 
 def test_figures_are_there_where_all_that_they_show_was_played(some, tmp_path):
@@ -73,7 +74,9 @@ def test_it_plays_and_reports(tmp_path):
     rows = read_rows("estimators", tmp_path)
     assert len(rows) == 4
     error = -1000.0 * rows.filter(estimator="ekf")["reward"].mean()
-    assert f"| ShortHighway-v0 | {error:.1f} [" in (tmp_path / "tables.md").read_text("utf-8")
+    assert f"| ShortHighway-v0 | none | {error:.1f} [" in (tmp_path / "tables.md").read_text(
+        "utf-8"
+    )
 
 
 def test_loops_stand_beside_queries_and_alone():

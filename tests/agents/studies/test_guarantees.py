@@ -12,6 +12,7 @@ from agents.studies import guarantees
 from agents.studies.guarantees import (
     BASE,
     LADDER,
+    SETTINGS_OF_EXACT,
     all_cells,
     met_epsilon,
     paid,
@@ -20,6 +21,7 @@ from agents.studies.guarantees import (
 )
 from agents.study import read_rows
 from agents.tables import DENSITY, format_interval, values
+from dptse_env.estimators import EstimatorSettings
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
 from dptse_env.schedules import make_schedule
@@ -49,7 +51,7 @@ def test_the_tables_are_those_of_the_rows(rows, tmp_path, monkeypatch):
     lines = [line_of(text, f"density RMSE [veh/km]: {each}") for each in ("`paced`", BOTH)]
     expected = [format_interval(mean_interval(each)) for each in (paced, paced - capped)]
     assert [line[4] for line in lines] == expected
-    assert line_of(text, "3. `paced`, EKF, `round-robin` (2)")[1] == expected[0]
+    assert line_of(text, "3. `paced`, EKF, `round-robin` (2)")[2] == expected[0]
     error = values(rows, priced("ekf", "event", epsilon=20.0).labels, DENSITY)
     assert line_of(text, "event")[-1] == format_interval(mean_interval(error))
     # For ε = 5, by both releases, and by densities alone.
@@ -62,14 +64,17 @@ def test_a_cell_that_was_not_played_is_a_dash(rows, tmp_path):
     few = rows.filter(pl.col("cell").is_in([priced("random_walk").id, own.id]))
     text = report(few, tmp_path)
     expected = format_interval(mean_interval(values(rows, own.labels, DENSITY)))
-    assert line_of(text, "9. `capped`, random walk, `round-robin` (4)")[1:3] == [expected, "-"]
+    assert line_of(text, "9. `capped`, random walk, `round-robin` (4)")[2:4] == [expected, "-"]
     # Nor are labels of a part that was not played at all columns of the rows.
     few = rows.filter(pl.col("cell") == priced("random_walk").id)
     few = few.select(name for name in few.columns if not few[name].null_count())
     text = report(few, tmp_path)
-    assert line_of(text, "1. `capped`, EKF, `shift-ahead` (1)")[1:] == ["-"] * 5
-    assert line_of(text, "random walk, nominal")[1] == "27.62 [26.08, 29.16]"
+    assert line_of(text, "1. `capped`, EKF, `shift-ahead` (1)")[2:] == ["-"] * 5
+    assert line_of(text, "random walk, nominal")[2] == "27.62 [26.08, 29.16]"
     assert not list(tmp_path.iterdir())
+    # What a cell guarantees is known without playing it; true boundary inputs void it.
+    lines = ("EKF, private", "EKF, true", "11. no noise, EKF, `round-robin` (3)")
+    assert [line_of(text, each)[1] for each in lines] == ["ε = 5, δ = 0.05", "none", "none"]
 
 
 def test_every_rung_differs_in_one_thing_from_the_one_that_it_is_held_against():
@@ -83,10 +88,10 @@ def test_every_rung_differs_in_one_thing_from_the_one_that_it_is_held_against():
 def test_every_cell_has_the_shipped_settings_of_its_estimator_and_release_model():
     for cell in all_cells():
         estimator, release = cell.keywords["estimator"], cell.keywords["privacy"]["preset"]
-        if release.endswith(":Exact"):
-            release = "paced"
-        else:
-            assert "estimator_settings" not in cell.keywords
+        if release.endswith(":Exact"):  # tuned for it
+            assert cell.config.settings() == EstimatorSettings(**SETTINGS_OF_EXACT)
+            continue
+        assert "estimator_settings" not in cell.keywords
         expected = None if estimator == "open_loop" else f"{estimator}-w99-3lane-{release}"
         assert cell.config.settings_name == expected
 

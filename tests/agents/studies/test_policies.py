@@ -113,9 +113,9 @@ def test_the_report_compares_with_the_rule_that_validation_chose(ladder, errors)
     assert line(text, BEST)[3:] == ["-"]
     # The learner with the most training seeds counts, and its best training in validation.
     summary = line(text, "short")
-    assert summary[2] == f"{errors[BEST].mean():.1f} (`{BEST}`)"
-    assert summary[5:] == ["ppo-road", found[2], "`trainings/short/ppo-road/0`"]
-    assert set(line(text, "private-1")[1:]) == {"-"}
+    assert summary[3] == f"{errors[BEST].mean():.1f} (`{BEST}`)"
+    assert summary[6:] == ["ppo-road", found[2], "`trainings/short/ppo-road/0`"]
+    assert set(line(text, "private-1")[2:]) == {"-"}
     assert {path.name for path in ladder.glob("*.png")} == {"fig_curves.png", "fig_below.png"}
 
 
@@ -126,7 +126,7 @@ def test_what_was_not_played_yet_is_a_dash(ladder):
     write_report(policies.STUDY, ladder)
     text = (ladder / "tables.md").read_text("utf-8")
     assert line(text, BEST)[2:] == ["0.0 [0.0, 0.0]", "-"]
-    assert line(text, "short")[4:] == ["-"] * 4
+    assert line(text, "short")[5:] == ["-"] * 4
     assert "| ppo-road |" not in text  # nothing says that these rows are those of its trainings
 
 
