@@ -14,9 +14,10 @@ from typing import Any
 
 from dptse_env.evaluation import Policy
 from dptse_env.policies import DETERMINISTIC, SUFFIX, read_policy, shipped_policies
-from dptse_env.schedules import make_schedule
+from dptse_env.schedules import SCHEDULES, make_schedule
 from dptse_env.utils.files import file_digest
 from dptse_env.utils.registry import require_registered
+from dptse_env.utils.validation import require
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,19 @@ class NamedPolicy:
     def keywords(self) -> dict[str, Any]:
         """Keywords of the environment that it fits: its actions, and its observation if named.
 
-        Schedules speak every encoding.
+        Schedules speak every encoding. A class of one's own names them by an attribute
+        ``keywords``.
 
         Raises:
-            ValueError: A block of the observation is no registered name.
+            ValueError: A block of the observation is no registered name; or a class cannot be
+                imported, or names other keywords.
         """
         if self.card is None:
-            return {}
+            is_own, known = ":" in self.source, {"action", "observation"}
+            named: Any = getattr(SCHEDULES.find(self.source), "keywords", {}) if is_own else {}
+            fits = isinstance(named, Mapping) and {*named} <= known
+            require(fits, f"{self.source}.keywords", "of action and observation", named)
+            return {**named}
         own: dict[str, Any] = {"action": self.card["fits"]["action"]}
         if (blocks := self.card["keywords"].get("observation")) is not None:
             require_registered(blocks, f"{self.source}: keywords.observation")
@@ -103,7 +110,8 @@ def policy_name(source: str) -> str:
     Files of trainings have one name; their folders differ.
     """
     path = Path(source)
-    return f"{path.parent.name}/{path.stem}" if path.suffix == SUFFIX else source
+    is_file = path.suffix == SUFFIX
+    return "/".join(filter(None, (path.parent.name, path.stem))) if is_file else source
 
 
 def find_policy(source: str) -> NamedPolicy:

@@ -26,6 +26,7 @@ import polars as pl
 from agents.executors import Executor, run_shown, this_process
 from agents.play import Cell, play, record
 from agents.tables import are_present, numbers
+from dptse_env.evaluation import WARM_UP
 from dptse_env.traffic import Records
 from dptse_env.utils.files import write_atomically
 from dptse_env.versions import code_version, numbers_of
@@ -143,6 +144,7 @@ def write_tables(folder: Path, content: str, rows: pl.DataFrame) -> None:
         equal.setdefault(numbers_of(version), []).append(f"{version} ({n:,} episodes)")
     versions = ", ".join(map(" = ".join, equal.values()))
     origin = f"Played by dptse-env {versions}. Differences are paired within equal numbers."
+    origin += f" Errors leave out the first {WARM_UP} s of an episode."
     write_atomically(folder / TABLES, f"{content}\n\n{origin}\n")
 
 

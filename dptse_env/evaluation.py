@@ -29,7 +29,7 @@ Row = dict[str, Any]
 
 
 class Policy(Protocol):
-    """A query policy: a schedule, or a model of stable-baselines3.
+    """A query policy: a schedule, a model of stable-baselines3, or `make_schedule`'s own of less.
 
     A policy that has an attribute ``deterministic`` says by it whether it is to take its likeliest
     action; others are.
@@ -71,6 +71,8 @@ def evaluate(
 ) -> list[Row]:
     """Play an episode on each traffic seed, and return a row for each.
 
+    The first 60 s of an episode do not count, unless ``warm_up`` says otherwise.
+
     A scalar environment plays them one after another, a vector environment as many at once as it
     has episodes. Both give the same rows, but for policies that draw at random: these draw for a
     whole batch at once, so other numbers from the same distribution.
@@ -78,8 +80,9 @@ def evaluate(
     Args:
         env: An environment of this package from ``gym.make`` or ``gym.make_vec``, wrapped or not;
             its ``traffic_seeds`` include the seeds.
-        policy: What `dptse_env.schedules.make_schedule` takes: the name of a schedule, a class, or
-            an object with ``predict``, such as a model of stable-baselines3.
+        policy: What `dptse_env.schedules.make_schedule` takes: the name of a schedule, a class, an
+            object with ``predict``, such as a model of stable-baselines3, or a function of the
+            observation. A vector environment gives it a batch of observations, (n, size).
         seeds: Traffic seeds, one or more.
         noise_seed: Noise and estimator are seeded with this plus the traffic seed.
         warm_up: Seconds at the start of an episode that do not count [s].
@@ -118,7 +121,9 @@ def evaluate(
     require(len(seeds) > 0, "seeds", "one or more traffic seeds", seeds)
     known = set(config.traffic_seeds)
     unknown = [seed for seed in seeds if seed not in known]
-    require(not unknown, "seeds", "among the environment's traffic_seeds", unknown)
+    remedy = f"make it with traffic_seeds={_as_keyword(seeds)}"
+    allowed = f"among the environment's traffic_seeds ({remedy})"
+    require(not unknown, "seeds", allowed, unknown)
     require(config.horizon_steps > warm_up, "warm_up", "shorter than an episode", warm_up)
     player = make_schedule(policy, bare)
     if deterministic is None:
@@ -136,6 +141,13 @@ def evaluate(
             found = [{**row, **more} for row, more in zip(found, watcher.rows(), strict=True)]
         rows += found[: len(wanted)]
     return rows
+
+
+def _as_keyword(seeds: Sequence[int]) -> str:
+    """Return the keyword ``traffic_seeds`` that has some seeds."""
+    first, stop = min(seeds), max(seeds) + 1
+    is_range = sorted(seeds) == [*range(first, stop)]
+    return repr(f"{first}:{stop}" if is_range else sorted({*seeds}))
 
 
 def require_in_step(env: SensorQueryVectorEnv) -> None:

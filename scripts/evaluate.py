@@ -400,5 +400,5 @@ def enter(args: Args, names: Sequence[str]) -> None:
     write_json(folder / CARD, card)
     shown = [entry, *(each["policy"][0] for each in others)]
     header, lines = suite.beside_rules(rows, shown)
-    title = f"{suite.NAME}: {suite.ZERO} has 0, {suite.ONE} has 1"
+    title = f"{suite.NAME}, from second {WARM_UP + 1} on: {suite.ZERO} has 0, {suite.ONE} has 1"
     args.answer(card, make_table(title, *header, rows=lines), f"the card is {folder / CARD}")

@@ -26,6 +26,7 @@ from agents.training.run_files import read_progress
 from agents.training.settings import PlackettLuceSettings, parse_algorithm
 from agents.training.training import train, train_all
 from dptse_env.config import parse_seeds
+from dptse_env.evaluation import WARM_UP
 from dptse_env.utils.validation import read_json
 from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, ValidationSeeds
 
@@ -118,7 +119,8 @@ def result(folder: Path) -> dict[str, Any]:
 def in_words(policy: str, error: float, best_rule: str, rule_error: float) -> str:
     """Return a `result` as a line of text."""
     share = 100.0 * (1.0 - error / rule_error)
+    side = "below" if share >= 0 else "above"
     return (
-        f"{policy}: error x 1000 in validation {1000 * error:.1f}, {abs(share):.1f} % "
-        f"{'below' if share >= 0 else 'above'} the best rule, {best_rule} ({1000 * rule_error:.1f})"
+        f"{policy}: error x 1000 in validation {1000 * error:.1f}, {abs(share):.1f} % {side} the "
+        f"best rule, {best_rule} ({1000 * rule_error:.1f}), without the first {WARM_UP} s"
     )

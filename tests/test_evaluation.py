@@ -73,6 +73,49 @@ def test_a_batch_gives_the_rows_of_a_learned_policy(action, deterministic):
     assert_same_rows(Learned, (1, 0), keywords, deterministic=deterministic)
 
 
+def oldest(observation):
+    """Query the segment that was not observed for the longest time."""
+    return np.eye(6, dtype=np.int8)[observation[..., 56:62].argmax(axis=-1)]
+
+
+class Alone:
+    def predict(self, observation):
+        return oldest(observation)
+
+
+class WithMode(Alone):
+    def predict(self, observation, deterministic=False):
+        assert deterministic
+        return oldest(observation), None
+
+
+class Bound(Alone):
+    def __init__(self, env):
+        assert env.interface.observations.slices["age"] == slice(56, 62)
+
+
+OWN = [oldest, Alone(), Alone, WithMode, Bound, f"{__name__}:Alone", f"{__name__}:oldest"]
+
+
+@pytest.mark.parametrize("policy", OWN)
+def test_a_policy_may_be_a_function_or_a_class_of_ones_own(policy):
+    """Its rows are those of the same choice with the signature of stable-baselines3."""
+
+    class Whole:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            return oldest(observation), None
+
+    expected = evaluate(make_vector(3, **FAST_ONES), Whole(), [0, 1, 2])
+    assert evaluate(make_vector(3, **FAST_ONES), policy, [0, 1, 2]) == expected
+    assert_same(evaluate(make_env(**FAST_ONES), policy, [1]), expected[1:2], tolerance=1e-9)
+
+
+@pytest.mark.parametrize("policy", [3, dict, {}])
+def test_what_cannot_act_is_no_policy(policy):
+    with pytest.raises(ValueError, match=r"must have predict\(\), or be a function of an obs"):
+        evaluate(make_env(), policy, [0])
+
+
 def test_the_baseline_is_evaluated_by_its_name():
     rows = dptse_env.evaluate(make_env(), "shift-ahead", seeds=range(2))
     assert rows == evaluate(make_env(), make_schedule("shift-ahead", make_env()), [0, 1])
@@ -130,7 +173,8 @@ def test_a_seed_gives_the_same_noise_under_every_policy_and_another_with_a_noise
     [
         (lambda: make_env(horizon=60), [0], "warm_up must be shorter than an episode, got 60"),
         (make_env, [], "seeds must be one or more"),
-        (make_env, [0, 7], r"seeds must be among the environment's traffic_seeds, got \[7\]"),
+        (make_env, [0, 7], r"environment's traffic_seeds \(make .* traffic_seeds=\[0, 7\]\), got "),
+        (make_env, range(2000, 2032), r"traffic_seeds='2000:2032'\), got \[2000,"),
         (lambda: make_vector(autoreset_mode="SameStep"), [0], "another autoreset_mode"),
         (lambda: gym.make("CartPole-v1"), [0], "environment of dptse_env, got CartPoleEnv"),
     ],

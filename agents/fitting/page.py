@@ -24,6 +24,7 @@ from agents.fitting.choice import FEW, Choice, interval
 from agents.page import watch
 from agents.statistics import mean_interval
 from agents.tables import DENSITY, ERROR, SPEED, Labels, chi2, error_label, markdown, values
+from dptse_env.evaluation import WARM_UP
 from dptse_env.model import ARZParameters
 from dptse_env.privacy import rounded_up
 from dptse_env.utils.arrays import FloatArray
@@ -72,8 +73,9 @@ def write_page(
         choice_table(choice, "estimator"),
         choice_table(choice, "policy"),
         "## Errors on test traffic",
-        f"Nothing was chosen on it. {intervals} χ² is the mean square of errors over reported "
-        f"deviations: 1 is honest. Plain is an EKF with {choice.home} and a round robin.",
+        f"Nothing was chosen on it. Errors leave out the first {WARM_UP} s. {intervals} χ² is the "
+        "mean square of errors over reported deviations: 1 is honest. "
+        f"Plain is an EKF with {choice.home} and a round robin.",
         table(choice, played),
         "## Traffic",
         f"![Speeds over densities of a lane, and the curve of each set of parameters]({DIAGRAM})",

@@ -6,6 +6,7 @@ number of episodes at once.
 """
 
 from abc import ABC, abstractmethod
+from inspect import signature
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from dptse_env.process import QueryProcess
 from dptse_env.release import Queries
 from dptse_env.spaces.actions import first_that_fit
 from dptse_env.utils.arrays import Action, BoolArray, FloatArray, IntArray, Observation
-from dptse_env.utils.registry import Registry, name_of_class
+from dptse_env.utils.registry import Registry
 
 OBSERVATION_SCHEDULES = {
     "none": "dptse_env.schedules.rules:Nothing",
@@ -48,10 +49,9 @@ ORACLES = {
 
 
 def _expected(part: Any) -> str | None:
-    if isinstance(part, type) and not issubclass(part, Schedule):
-        return "be a subclass of dptse_env.schedules.Schedule"
-    if not callable(part) and not callable(getattr(part, "predict", None)):
-        return "be a subclass of dptse_env.schedules.Schedule, or have predict()"
+    acts = callable(part) and not isinstance(part, type)
+    if not acts and not callable(getattr(part, "predict", None)):
+        return "have predict(), or be a function of an observation"
     return None
 
 
@@ -62,24 +62,63 @@ SCHEDULES = Registry(
 
 
 def make_schedule(schedule: Any, env: Any, seed: int | None = None) -> Any:
-    """Return a schedule for an environment.
+    """Return a policy with the ``predict`` of stable-baselines3, for an environment.
 
     Args:
-        schedule: A name in `SCHEDULES`, ``"package.module:Class"``, a subclass of `Schedule`, or
-            an object with ``predict``, which is returned as it is.
+        schedule: A name in `SCHEDULES`, ``"package.module:Name"``, a class, an object with
+            ``predict``, or a function. A class other than a `Schedule` is called with the bare
+            environment, or without arguments if it takes none. A function, and a ``predict`` of
+            fewer arguments, are called with the observation, (size,) or (k, size), and return the
+            action, (...) or (k, ...), or a tuple that begins with it.
         env: An environment of this package, scalar or vector, wrapped or not.
         seed: Seed of the schedule's random choices.
 
     Raises:
         ValueError: The name is unknown or the schedule does not suit the environment.
     """
-    part, env = SCHEDULES.find(schedule), env.unwrapped
-    if not isinstance(part, type):
-        return part
-    made: Any = part(env.process if issubclass(part, ProcessSchedule) else env.interface, seed)
-    if not callable(getattr(made, "predict", None)):
-        raise ValueError(f"schedule {name_of_class(part)} must have predict()")
-    return made
+    part, bare = SCHEDULES.find(schedule), env.unwrapped
+    policy: Any = part
+    if isinstance(part, type):
+        if issubclass(part, Schedule):
+            needs_process = issubclass(part, ProcessSchedule)
+            policy = part(bare.process if needs_process else bare.interface, seed)
+        else:
+            make: Any = part
+            policy = make(bare) if signature(make).parameters else make()
+    return policy if _remembers(policy) else Memoryless(policy)
+
+
+def _remembers(policy: Any) -> bool:
+    """Return whether a policy has a ``predict`` of observation, state, start and mode."""
+    try:
+        signature(policy.predict).bind(None, None, None, True)
+    except (AttributeError, TypeError):
+        return False
+    return True
+
+
+class Memoryless:
+    """A policy made of a function of the observation, or of a ``predict`` that takes little more.
+
+    A ``predict`` with an argument ``deterministic`` is given it.
+    """
+
+    def __init__(self, policy: Any) -> None:
+        """Take a function, or an object with ``predict``."""
+        self._act = getattr(policy, "predict", policy)
+        self._names_mode = "deterministic" in signature(self._act).parameters
+
+    def predict(
+        self,
+        observation: Observation,
+        state: None = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[Action, None]:
+        """Return the actions for one observation (size,) or a batch (k, size)."""
+        mode = {"deterministic": deterministic} if self._names_mode else {}
+        found = self._act(observation, **mode)
+        return np.asarray(found[0] if isinstance(found, tuple) else found), None
 
 
 class ScheduleState(NamedTuple):

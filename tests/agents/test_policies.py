@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -67,6 +68,25 @@ def test_a_schedule_has_a_name():
     action, _ = schedule.load(env).predict(observation, None, None)
     expected, _ = make_schedule("shift-ahead", env).predict(observation, None, None)
     np.testing.assert_array_equal(action, expected)
+
+
+class Slots:
+    keywords: ClassVar = {"action": "slots"}
+
+    def predict(self, observation):
+        return np.zeros((*np.shape(observation)[:-1], 2), dtype=int)
+
+
+class Wrong(Slots):
+    keywords: ClassVar = {"privacy": "exact"}
+
+
+def test_a_class_of_ones_own_names_its_actions_and_nothing_else():
+    own = find_policy(f"{__name__}:Slots")
+    assert own.keywords == {"action": "slots"}
+    Cell(SHORT, f"{__name__}:Slots", {"horizon": 70}).check()
+    with pytest.raises(ValueError, match=r":Wrong\.keywords must be of action and observation"):
+        find_policy(f"{__name__}:Wrong").keywords  # noqa: B018
 
 
 def test_a_card_without_recipe_and_training_seed_does(tmp_path):

@@ -31,11 +31,14 @@ GUIDES = {
     "train-a-policy.md": {
         "--minutes 8": "--steps 8192 --train-seeds 0:2 --validation-seeds 1000:1002",
         "--test-seeds 2000:2032": "--test-seeds 2000:2002 --workers 1",
-        "dptse evaluate --suite": "dptse evaluate --suite short",
+        "dptse evaluate --suite --policies": "dptse evaluate --suite short --policies",
         '"0:64"': '"0:2"',
         "1_000_000": "8192",
         'num_envs=8, traffic_seeds="2000:2008"': 'num_envs=2, traffic_seeds="2000:2002"',
         "range(2000, 2008)": "range(2000, 2002)",
+        'gym.make(id, traffic_seeds="2000:2008"': 'gym.make(id, traffic_seeds="2000:2002"',
+        "n_eval_episodes=8": "n_eval_episodes=2",
+        " / 8 for": " / 2 for",
     },
     "your-road.md": {
         "dptse fit my-road.toml": f"dptse fit my-road.toml {FIT} {SEEDS}",
@@ -69,7 +72,8 @@ def run_guide(tmp_path, monkeypatch):
     """Return a function that runs the blocks of a guide in an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    for module in ("mine", "mynet"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
 
     def run(guide: str) -> Ran:
         names, printed, replaced = {"__name__": "documentation"}, io.StringIO(), set()
@@ -117,8 +121,9 @@ def test_a_policy_is_trained_compared_and_entered_in_the_suite(run_guide):
     printed, names = run_guide("train-a-policy.md")
     assert re.search(r"% (below|above)", printed)
     assert all(Path(name).is_file() for name in ("mine/curve.png", "mine/test/space_time.png"))
-    card = json.loads(next(Path().glob("results/my-suite/**/card.json")).read_text())
-    assert card["scores"].keys() == {"short"}
+    for name in ("mine/best", "mynet-Net"):
+        card = json.loads(Path("results/my-suite", name, "card.json").read_text())
+        assert card["scores"].keys() == {"short"}
     observation = names["envs"].reset(seed=0)[0]
     loaded, imported = (
         names["load_policy"](file, names["unseen"]).predict(observation, deterministic=True)[0]

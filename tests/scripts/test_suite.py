@@ -1,12 +1,15 @@
 """The suite by the command."""
 
 import json
+import sys
+from pathlib import Path
 
 import pytest
 
 from dptse_env.policies import read_policy
 from tests.agents.studies.test_suite import SMALL, recorded, small  # noqa: F401 (fixtures)
-from tests.helpers import save_untrained
+from tests.docs.blocks import blocks_of
+from tests.helpers import ROOT, SHORT, save_untrained
 from tests.scripts.commands import refused, run_command
 
 pytestmark = pytest.mark.usefixtures("small")
@@ -40,6 +43,50 @@ def test_the_first_policy_that_suits_a_cell_acts_in_it(tmp_path):
     acting = {name: each["name"] for name, each in card["policies"].items()}
     assert acting == {"plain": "run/best", "paced": "static"}
     assert card["policies"]["plain"]["identity"] == read_policy(saved).card["sha256"]
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    """Save the files of the page on training in an empty folder; return its other Python."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "mynet", raising=False)
+    blocks = blocks_of(ROOT / "docs" / "guides" / "train-a-policy.md")
+    for block in blocks:
+        if block.file:
+            Path(block.file).write_text(block.text)
+    return [block.text for block in blocks if block.language == "python" and not block.file]
+
+
+def test_a_torch_module_of_the_page_enters_by_its_class(page):
+    words = "--workers", "1", "--policies", "mynet:Net"
+    done = run_command("evaluate", "--suite", *words)
+    assert done.returncode == 0, done.stderr
+    card = json.loads(Path("results/my-suite/mynet-Net/card.json").read_text())
+    assert card["scores"].keys() == SMALL.keys()
+    env = SHORT + ' {"bandwidth": 1, "estimator": "random_walk", "horizon": 80}'
+    short = "--test-seeds", "2000:2002", "--output", "out"
+    done = run_command("evaluate", "--env", env, *words, "random", *short)
+    assert done.returncode == 0, done.stderr
+    assert "mynet:Net" in done.stdout
+
+
+def test_a_policy_that_the_page_saves_enters(page):
+    text = page[0]
+    for whole, part in {
+        "1_000_000": "64", '"n_steps": 64': '"n_steps": 2', "1024": "64",
+        "num_envs=128": "num_envs=32",
+        '"bandwidth": 1': '"bandwidth": 2, "estimator": "random_walk"', '"0:64"': '"0:2"',
+        "num_envs=8": "num_envs=2", "2000:2008": "2000:2002", "2000, 2008": "2000, 2002",
+    }.items():  # fmt: skip
+        assert whole in text
+        text = text.replace(whole, part)
+    exec(compile(text, "page", "exec"), {"__name__": "page"})
+    words = "plain", "--policies", "mlp.safetensors", "--workers", "1"
+    done = run_command("evaluate", "--suite", *words)
+    assert done.returncode == 0, done.stderr
+    card = json.loads(Path("results/my-suite/mlp/card.json").read_text())
+    assert card["scores"].keys() == {"plain"}
 
 
 @pytest.mark.parametrize(
