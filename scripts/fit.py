@@ -178,27 +178,23 @@ def fit_road(args: Args, path: Path) -> None:
     """Fit, choose, evaluate, and write the page and the road file."""
     folder = args.output or folder_of(path)
     road, stages, copy = checked_road(args, path, folder), folder / STAGES, copy_of(path)
-    args.remark("[1/5] record traffic")
+    args.remark("[1/4] record traffic")
     library = args.library(road.config.corridor, road.all_seeds)
     dwell = road.measure_dwell(library)
     keep_plan(folder, road.plan(args.trials))
     road.write_played(stages, dwell)
     choice = Choice(road, args.place(stages), shipped_sets(road))
-    args.remark("[2/5] fit ARZ parameters")
+    args.remark("[2/4] fit ARZ parameters")
     density, speed = traffic_of(road.config.corridor, road.seeds["training"], library)
     fit = fitted(choice, library, args.trials, 1.01 * float(density.max()))
     name = fit.parameters.name
     keep(folder / f"{name}.json", fit, road)
     choice.sets[name] = {"parameters": str(folder / f"{name}.json")}
-    args.remark("[3/5] choose an estimator and parameters")
-    options = estimators_tried(choice, args, name)
-    choice.choose("estimator", options)
-    args.remark("[4/5] choose a query policy")
-    choice.choose("policy", [{"policy": each} for each in args.policies or POLICIES_TRIED])
-    if choice.policy != ROUND_ROBIN:
-        choice.choose("estimator", options)
+    args.remark("[3/4] choose an estimator with its parameters, and a query policy")
+    policies = [{"policy": each} for each in args.policies or POLICIES_TRIED]
+    choice.settle(estimators_tried(choice, args, name), policies)
     note_parameters(choice, fit)
-    args.remark("[5/5] evaluate on test traffic, and over bandwidth and epsilon")
+    args.remark("[4/4] evaluate on test traffic, and over bandwidth and epsilon")
     finalists = [*choice.finalists("estimator"), *choice.finalists("policy")]
     wanted = [choice.tested, choice.plain, *({**each, "traffic": "test"} for each in finalists)]
     played = choice.play([*{str(each): each for each in wanted}.values()])

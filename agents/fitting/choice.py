@@ -1,8 +1,8 @@
 """Comparisons of a fit on validation traffic, its choices there, and its episodes on test traffic.
 
 Estimators are compared under round robin, each with inherited and with fitted parameters; then
-query policies with the chosen estimator; then the estimators again where another policy was chosen.
-So no estimator is proposed that loses to another one under the proposed policy.
+query policies with the chosen estimator and the estimators under the chosen policy, until neither
+changes. So no estimator is proposed that loses to another one under the proposed policy.
 """
 
 from __future__ import annotations
@@ -35,6 +35,9 @@ POLICIES_TRIED = (
     "largest-deviation", "speed-front", "expected-reduction",
 )  # fmt: skip
 """Query policies among which it chooses, the simplest first."""
+
+ROUNDS = 3
+"""Most comparisons of query policies; after each come the estimators again."""
 
 NOISE = {"training": TUNING, "validation": CHOICE, "test": EVALUATION}
 """Seeds of the noise by kind of traffic."""
@@ -167,6 +170,24 @@ class Choice:
             found.setdefault(labels[what], []).append(labels)
         now = self.labels("validation")
         return [now if now in each else self.best(each) for each in found.values()]
+
+    def settle(self, estimators: Sequence[Labels], policies: Sequence[Labels]) -> None:
+        """Choose an estimator, then a query policy and an estimator again until neither changes.
+
+        Args:
+            estimators: Changes of what is chosen, the simplest first.
+            policies: The same.
+
+        Raises:
+            ValueError: The environment refuses all estimators or policies.
+        """
+        self.choose("estimator", estimators)
+        for _ in range(ROUNDS):
+            before = self.tested
+            self.choose("policy", policies)
+            self.choose("estimator", estimators)
+            if self.tested == before:
+                return
 
     def choose(self, what: str, options: Sequence[Labels]) -> None:
         """Play changes of what is chosen on validation traffic, and choose one that is unbeaten.

@@ -64,7 +64,8 @@ def write_page(
         f"{heading(road.env, cell.all_keywords)}. Settings of {choice.estimator}: "
         f"{settings_of(road.env, cell.all_keywords)}.",
         "## Bandwidth and epsilon",
-        f"Error x 1000 of what was chosen, on {min(n, SEEDS)} of {n} episodes of test traffic, "
+        f"Error x 1000 of what was chosen at bandwidth {road.config.bandwidth} and ε = "
+        f"{road.config.privacy.epsilon:g}, on {min(n, SEEDS)} of {n} episodes of test traffic, "
         f"with δ = {rounded_up(road.config.privacy.delta)} and the same settings at each ε:",
         budget_table(budgets),
         advice(budgets, road.config.privacy.epsilon),

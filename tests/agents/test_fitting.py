@@ -291,6 +291,38 @@ def test_a_start_is_slowed_down_until_the_time_step_suits_short_segments(tmp_pat
 
 
 @pytest.mark.parametrize(
+    ("means", "chosen"),
+    [
+        # Under round robin the EKF errs least, under the policy that it likes another one.
+        ({"ekf": (50, 40, 60), "ukf": (60, 30, 60)}, ("ukf", "speed-front")),
+        # And that one likes a third policy.
+        ({"ekf": (50, 40, 60), "ukf": (60, 30, 20)}, ("ukf", "static")),
+        # Each policy has an estimator that likes another policy: in the end the estimator decides.
+        ({"ekf": (50, 40, 60), "ukf": (10, 30, 60)}, ("ukf", "round-robin")),
+        ({"ekf": (50, 50, 50), "ukf": (50, 50, 50)}, ("ekf", "round-robin")),
+    ],
+)
+def test_no_estimator_loses_under_the_policy_that_is_proposed(means, chosen, tmp_path, monkeypatch):
+    path = tmp_path / "my-road.toml"
+    path.write_text(ROAD)
+    road = find_road(path, ID, tmp_path, dict(zip(KINDS, ("0", "1000:1004", "2000"), strict=True)))
+    choice = Choice(road, Place(tmp_path, this_process), {"w99-3lane": {}}, parameters="w99-3lane")
+    policies = "round-robin", "speed-front", "static"
+    monkeypatch.setattr(choosing.Choice, "play", lambda self, wanted: wanted)
+
+    def errors(self, labels):
+        mean = means[labels["estimator"]][policies.index(labels["policy"])]
+        return np.array([-1.0, 0.0, 0.0, 1.0]) + mean
+
+    monkeypatch.setattr(choosing.Choice, "errors", errors)
+    choice.settle([{"estimator": each} for each in means], [{"policy": each} for each in policies])
+    assert (choice.estimator, choice.policy) == chosen
+    least = min(own[policies.index(choice.policy)] for own in means.values())
+    assert means[choice.estimator][policies.index(choice.policy)] == least
+    assert {each["estimator"] for each in choice.compared["policy"]} == {choice.estimator}
+
+
+@pytest.mark.parametrize(
     ("errors", "chosen"),
     [
         ({"ekf": [50, 60, 70, 80], "ukf": [40, 50, 60, 71]}, "ukf"),
@@ -527,6 +559,7 @@ def test_a_measured_field_with_one_test_window_is_fitted(tmp_path):
     assert env.unwrapped.config.inherited == ("estimator_settings",)
 
 
+@pytest.mark.slow
 def test_a_fit_tells_once_on_which_roads_the_chosen_weights_were_trained(tmp_path):
     path = tmp_path / "fast.toml"
     path.write_text(ROAD.replace("speed_limit = 90", "speed_limit = 250").replace("= 4 ", "= 6 "))

@@ -162,22 +162,6 @@ def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):
     assert "Warning" not in done.stderr
 
 
-def test_a_run_tells_once_on_which_roads_weights_were_trained(tmp_path, caplog):
-    road = tmp_path / "road.toml"
-    text = "n_mainline = 6\nduration = 62\nspeed_limit = 250\nlanes = 1\n"
-    road.write_text(f"{text}[demand]\nmainline = [[0, 1500]]\n")
-    env = f'dptse_env:dptse/PrivateHighway-v1 {{"corridor": "{road}", "bandwidth": 2}}'
-    words = ["--env", env, "--test-seeds", "2000", "--policies", "none", "round-robin"]
-    words += ["--workers", "1", "--records", tmp_path / "records", "--output", tmp_path / "out"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        done = run_command("evaluate", *words, "--estimators", "random_walk", "recurrent")
-    assert done.returncode == 0, done.stderr
-    told = [each.message for each in caplog.records if "was trained on" in each.message]
-    assert len(told) == 1
-    assert "roads-flows was trained on speed_limit 60 to " in told[0]
-
-
 def test_policies_and_schedules_play_what_gym_make_makes(tmp_path):
     path = save_untrained(tmp_path / "run" / "best.safetensors")
     done = run_command(
@@ -219,6 +203,16 @@ def test_every_estimator_whose_settings_nobody_tuned_is_told():
     with pytest.warns(UserWarning, match="^estimator_settings: .*that nobody tuned") as told:
         make_cells(args)
     assert len(told) == 1
+
+
+def test_a_run_tells_one_text_of_weights_that_were_trained_on_other_roads():
+    road = {"speed_limit": 250, "average_dwell": 5.0}
+    env = f"dptse_env:dptse/PrivateHighway-v1 {json.dumps({'corridor': road})}"
+    args = Args(env=env, policies=("none",), estimators=("random_walk", "recurrent"))
+    with pytest.warns(UserWarning, match="values measured") as told:
+        make_cells(args)
+    (said,) = {str(each.message) for each in told if "was trained on" in str(each.message)}
+    assert "; roads-flows was trained on speed_limit 60 to " in said
 
 
 @pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
