@@ -46,8 +46,8 @@ LATEST = 2**40
 
 _ONE = np.array([0])
 _NO_QUERIES = {
-    "privacy": "corrected", "penetration": 1.0, "sensor_settings": {}, "query_spans": (1,),
-    "bandwidth": 1,
+    "privacy": "corrected", "epsilon": 5.0, "penetration": 1.0, "sensor_settings": {},
+    "query_spans": (1,), "bandwidth": 1,
 }  # fmt: skip
 """Keywords that a road file may have for queries, which nobody asks here."""
 

@@ -158,6 +158,16 @@ def test_a_stream_beyond_the_card_of_weights_is_told_once(name, keywords, value,
     assert f"not {value};" in said
 
 
+def test_queries_of_a_road_file_do_not_lie_beyond_the_card_where_a_stream_has_none(tmp_path):
+    known = ROAD.replaced(segment_length=0.1)
+    write_corridor(tmp_path / "road.toml", known, {"epsilon": 0.01, "penetration": 0.01})
+    settings = weights_settings(tmp_path, epsilon=[0.5, 20.0], connected=[0.05, 1.0])
+    given = {"estimator": "recurrent", "estimator_settings": settings}
+    road = str(tmp_path / "road.toml")
+    assert len(told_beyond(partial(gym.make, ID, corridor=road, **given))[1]) == 1
+    assert told_beyond(partial(RoadEstimator, road, **given))[1] == []
+
+
 def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):
     road = tmp_path / "short.toml"
     write_corridor(road, ROAD.replaced(segment_length=(0.1,) * 7 + (0.04,)))

@@ -175,8 +175,8 @@ class Choice:
         """Choose an estimator, then a query policy and an estimator again until neither changes.
 
         Args:
-            estimators: Changes of what is chosen, the simplest first.
-            policies: The same.
+            estimators: Changes of estimator and parameters, the simplest first.
+            policies: Changes of the query policy, the simplest first.
 
         Raises:
             ValueError: The environment refuses all estimators or policies.
