@@ -2,11 +2,10 @@ r"""Fit parameters, estimator and query policy to a road, and write them into it
 
 dptse fit my-road.toml
 
-It records traffic that is missing, fits ARZ parameters by the filter's error on training traffic,
-chooses an estimator with its parameters and a query policy on validation traffic, and plays them
-once on test traffic. The folder my-road-fit gets fit.md, which says what to do next. With --tune it
-searches settings of estimators instead, of the road or of --env. The same command goes on after
-Ctrl-C.
+It records traffic that is missing, fits ARZ parameters on training traffic, chooses an estimator
+and a query policy on validation traffic, and plays them once on test traffic. The folder
+my-road-fit gets fit.md, which says what to do next. With --tune it searches settings of estimators
+instead, of the road or of --env. The same command goes on after Ctrl-C.
 """
 
 from __future__ import annotations
