@@ -139,7 +139,7 @@ def test_a_road_file_becomes_a_compared_policy(run_guide):
     need("stable_baselines3")
     printed, _ = run_guide("your-road.md")
     chosen = tomllib.loads(Path("my-road.toml").read_text(encoding="utf-8"))["environment"]
-    assert f"\n{chosen['estimator']} [" in printed
+    assert f"Settings of {chosen['estimator']}: " in printed
     page = Path("my-road-fit/fit.md").read_text(encoding="utf-8")
     assert all(each in page for each in ("dptse train", "dptse evaluate", "dptse fit --tune"))
     assert "best" in Path("my-road-fit/comparison/tables.md").read_text(encoding="utf-8")
