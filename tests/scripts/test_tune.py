@@ -5,6 +5,8 @@ import gymnasium as gym
 import optuna
 import pytest
 
+from agents.environments import make_config
+from agents.play import record
 from agents.search.tuning import n_finished
 from tests.helpers import SHORT, run_killed
 from tests.scripts.commands import refused, run_command
@@ -62,6 +64,7 @@ def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
         "--train-seeds", "0:2", "--trials", "16", "--workers", "2", "--output", tmp_path,
     )  # fmt: skip
     journal = tmp_path / "trials.journal"
+    record(make_config(SHORT, {}).corridor, range(2))  # whose bar would count, too
     assert run_killed("dptse_env.utils.progress:tqdm", "update", 4, *words).returncode == -9
     n = finished(journal)
     assert 4 <= n < 16
