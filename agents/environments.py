@@ -182,9 +182,9 @@ def settings_of(env: str, keywords: Mapping[str, Any]) -> str:
     if config.settings_name is not None:
         return config.settings_name
     if config.estimator == "recurrent":
-        flows = config.release_model.centre(config.corridor, config.privacy) is not None
         weights = config.settings().recurrent.weights
-        return f"weights {weights_for(weights, config.corridor.road, flows).source}"
+        saved = weights_for(weights, config.corridor.road, config.releases_flow)
+        return f"weights {saved.source}"
     if config.estimator_settings is None:
         return "defaults"
     given = keywords.get("estimator_settings", "those of the road file")

@@ -225,6 +225,11 @@ class EnvConfig:
         given, parameters = self.estimator_settings, self.parameters
         return _shipped(given, self.estimator, parameters, self.privacy, self.corridor)
 
+    @property
+    def releases_flow(self) -> bool:
+        """True where centred flows are released, False where mean speeds are."""
+        return self.release_model.centre(self.corridor, self.privacy) is not None
+
     def settings(self) -> Any:
         """Return the estimator's settings in force, of its settings' type.
 
@@ -235,10 +240,9 @@ class EnvConfig:
 
     def made_for(self) -> Mapping[str, str]:
         """Return settings that were made for other roads, traffic or releases, and for which."""
-        flows = self.release_model.centre(self.corridor, self.privacy) is not None
         estimator: type[Estimator] = ESTIMATORS.find(self.estimator)
         with within(self.origins.get("estimator_settings", "")):
-            return estimator.inherits(self.corridor.road, _played(self, flows), self.settings())
+            return estimator.inherits(self.corridor.road, _played(self), self.settings())
 
 
 # Readers ------------------------------------------------------------------------------------------
@@ -716,7 +720,7 @@ def _is_untuned(config: EnvConfig, is_other: bool) -> bool:
     return is_other or is_of_another_road(name, config.corridor.name)
 
 
-def _played(config: EnvConfig, flows: bool) -> Played:
+def _played(config: EnvConfig) -> Played:
     """Return the numbers of an environment that cards of weights may name."""
     conditions, share = config.corridor.conditions, config.penetration.share
     limit = config.corridor.geometry.largest_speed_limit
@@ -729,7 +733,7 @@ def _played(config: EnvConfig, flows: bool) -> Played:
     headways = [each.headway for each in own or [conditions.drivers]]
     loops = config.corridor.loops
     return {
-        "flows": (flows,),
+        "flows": (config.releases_flow,),
         "span": (max(config.query_spans),),
         "epsilon": (config.privacy.epsilon,),
         "connected": share if isinstance(share, tuple) else (share,),

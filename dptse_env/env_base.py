@@ -75,7 +75,7 @@ class QueryEnvBase:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What it was registered as, with its keywords.
+        """Its registration with Gymnasium, with its keywords.
 
         ``max_episode_steps`` is `n_steps`. Ids are registered without it: keywords change it, and
         a time limit of Gymnasium would cut longer episodes.
@@ -93,9 +93,8 @@ class QueryEnvBase:
         varies = actions.picks_one_by_one and self.interface.queries.costs_differ
         if varies or is_foreign(actions):
             return None
-        return math.ceil(self.config.horizon_steps / self.config.query_every) * (
-            actions.actions_per_step
-        )
+        decisions = math.ceil(self.config.horizon_steps / self.config.query_every)
+        return decisions * actions.actions_per_step
 
     @property
     def process(self) -> QueryProcess:

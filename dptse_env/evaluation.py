@@ -29,7 +29,7 @@ Row = dict[str, Any]
 
 
 class Policy(Protocol):
-    """A query policy: a schedule, a model of stable-baselines3, or `make_schedule`'s own of less.
+    """A query policy: a schedule, a model of stable-baselines3, or what `make_schedule` returns.
 
     A policy that has an attribute ``deterministic`` says by it whether it is to take its likeliest
     action; others are.

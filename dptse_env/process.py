@@ -447,10 +447,8 @@ class QueryProcess:
         }
         if self.config.truth_in_info:
             truth = self.truth(episodes)
-            infos["true_density"], infos["true_speed"] = (
-                truth[:, :, 0].copy(),
-                truth[:, :, 1].copy(),
-            )
+            infos["true_density"] = truth[:, :, 0].copy()
+            infos["true_speed"] = truth[:, :, 1].copy()
             infos["time"] = self.time[episodes].astype(np.float64)
         return infos
 

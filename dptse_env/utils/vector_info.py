@@ -1,8 +1,8 @@
 """Conversion of per-episode info between batches, scalar dicts and Gymnasium's vector form.
 
 *Infos* of k episodes are a dict of arrays with a leading axis of length k. Gymnasium's vector form
-has arrays over all n episodes and, under the same key with a leading
-underscore, the flags of the episodes that have a value.
+has arrays over all n episodes and, under the same key with a leading underscore, the flags of the
+episodes that have a value.
 """
 
 from collections.abc import Mapping
