@@ -172,8 +172,9 @@ def compare(args: Args) -> None:
     draw_traffic(args, title, scores, cells)
     header, lines = make_rows(scores, args.reference)
     table = markdown([each.replace("\n", " ") for each in header], lines)
+    of_estimator = {each.labels["estimator"]: each for each in cells}
     settings = {
-        each.labels["estimator"]: settings_of(each.env, each.all_keywords) for each in cells
+        name: settings_of(each.env, each.all_keywords) for name, each in of_estimator.items()
     }
     notes = f"{legend(seeds)}. Settings {in_force(settings)}"
     write_tables(args.output, f"# {title}\n\n{notes}.\n\n{table}", rows)

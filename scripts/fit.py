@@ -195,8 +195,8 @@ def fit_road(args: Args, path: Path) -> None:
     note_parameters(choice, fit)
     args.remark("[4/4] evaluate on test traffic, and over bandwidth and epsilon")
     finalists = [*choice.finalists("estimator"), *choice.finalists("policy")]
-    wanted = [choice.tested, choice.plain, *({**each, "traffic": "test"} for each in finalists)]
-    played = choice.play([*{str(each): each for each in wanted}.values()])
+    compared = [{**each, "traffic": "test"} for each in finalists]
+    played = choice.play([choice.tested, choice.plain, *compared])
     budgets = play_budgets(choice)
 
     keywords = chosen_keywords(choice, road)
