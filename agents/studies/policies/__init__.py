@@ -117,7 +117,7 @@ class Setting(NamedTuple):
     """An environment in which policies are compared.
 
     Attributes:
-        description: What it is, without its guarantee.
+        description: Its words in tables, without the guarantee.
         env: Environment id.
         keywords: Keywords of the environment.
         traffic: Traffic seeds.
@@ -137,7 +137,7 @@ class Setting(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What it is, with its guarantee, if it has one."""
+        """Its description with the guarantee, if there is one."""
         return f"{self.description}, {self.guarantee}".removesuffix(", none")
 
 
