@@ -67,7 +67,7 @@ def import_model(
         config,
         env=env,
         keywords={key: value for key, value in keywords.items() if key != "action"},
-        training=about,
+        training={"traffic seeds": "not said", **about},
         figures={},
         normalisation=scaled,
         deterministic=deterministic,

@@ -23,6 +23,7 @@ from agents.training.plan import TrainingPlan
 from agents.training.run_files import Row, TrainingFolder
 from agents.training.settings import PlackettLuceSettings
 from dptse_env.evaluation import evaluate
+from dptse_env.policies import seed_ranges
 from dptse_env.sb3 import ActingPolicy, save_policy
 from dptse_env.traffic import Records
 from dptse_env.utils.progress import make_bar
@@ -158,8 +159,8 @@ class Run(TrainingFolder):
                 "seed": plan.seed,
                 "also": list(plan.envs[1:]),
                 "steps": int(row["steps"]),
-                "traffic seeds": _range(plan.traffic_seeds),
-                "validation seeds": _range(plan.validation_seeds),
+                "traffic seeds": seed_ranges(plan.traffic_seeds),
+                "validation seeds": seed_ranges(plan.validation_seeds),
             },
             figures={key: row[key] for key in row if key.startswith("validation")},
             normalisation=scaled,
@@ -246,8 +247,3 @@ def draw_curve(rows: Sequence[Row], rules: Mapping[str, float]) -> Figure:
     axis.set_xlabel("seconds of traffic", fontsize=9)
     axis.set_ylabel("error x 1000", fontsize=9)
     return finish_figure(figure)
-
-
-def _range(seeds: tuple[int, ...]) -> str:
-    contiguous = seeds == tuple(range(seeds[0], seeds[0] + len(seeds)))
-    return f"{seeds[0]}..{seeds[-1]}" if contiguous else ", ".join(map(str, seeds))

@@ -1,7 +1,7 @@
 """Saved policies: weights with a card, read without torch; some come with the package."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,16 @@ class PolicyFile:
 def shipped_policies() -> list[str]:
     """Return the names of the policies that come with the package."""
     return sorted(path.stem for path in _FOLDER.glob(f"*{SUFFIX}"))
+
+
+def seed_ranges(seeds: Sequence[int]) -> str:
+    """Return traffic seeds as a card has them, ``"0..63, 70"``."""
+    known = set(seeds)
+    ordered = sorted(known)
+    starts = [seed for seed in ordered if seed - 1 not in known]
+    ends = [seed for seed in ordered if seed + 1 not in known]
+    pairs = zip(starts, ends, strict=True)
+    return ", ".join(f"{low}..{high}" if low < high else f"{low}" for low, high in pairs)
 
 
 def read_policy(source: str | os.PathLike[str]) -> PolicyFile:

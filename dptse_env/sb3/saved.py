@@ -21,7 +21,14 @@ from torch import nn
 from dptse_env.config import EnvConfig
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.parts import QueryInterface, make_interface
-from dptse_env.policies import DETERMINISTIC, DRAWN, SUFFIX, TRANSFERABLE, read_policy
+from dptse_env.policies import (
+    DETERMINISTIC,
+    DRAWN,
+    SUFFIX,
+    TRANSFERABLE,
+    read_policy,
+    seed_ranges,
+)
 from dptse_env.release import RELEASE_MODELS, PrivacySettings
 from dptse_env.sb3.acting import ActingPolicy, Normalisation
 from dptse_env.sb3.road_policy import MOST_NEIGHBOURS, RoadChannels, RoadPolicy
@@ -116,7 +123,8 @@ def save_policy(
         config: Configuration of the environment that it was trained on.
         env: Id of that environment.
         keywords: Keywords of that environment, plain JSON.
-        training: Recipe, seeds, steps; plain JSON.
+        training: Recipe, seeds, steps; plain JSON. ``traffic seeds`` are those of ``config`` unless
+            it names others.
         figures: Results, by name; plain JSON.
         normalisation: The wrapper that scaled its observations in the training. Its statistics
             travel in the file, and are applied wherever the policy acts.
@@ -147,7 +155,7 @@ def save_policy(
             "trained_on": describe_road(config.corridor),
             "estimator": ESTIMATORS.name_of(config.estimator),
             "versions": versions_with("stable-baselines3", "torch"),
-            "training": dict(training),
+            "training": {"traffic seeds": seed_ranges(config.traffic_seeds), **training},
             "figures": dict(figures),
         }
         weights = _actor(policy, kind)

@@ -63,7 +63,8 @@ def test_an_imported_model_acts_as_it_did(tmp_path, action, kind, policy, keywor
     given = shlex.quote(f"{SHORT} {json.dumps(keywords)}")
     assert f"next: dptse evaluate --env {given} --policies {path}\n" in done.stdout
     imported = load_policy(path, env)
-    assert imported.card["training"] == {"learner": "imported", "seed": 4, "steps": 0}
+    told = {"learner": "imported", "seed": 4, "steps": 0, "traffic seeds": "not said"}
+    assert imported.card["training"] == told
     assert not imported.deterministic
     seen, _ = env.reset(seed=1)
     expected, _ = model.predict(scaled.normalize_obs(seen), deterministic=True)
