@@ -12,6 +12,7 @@ import pytest
 
 import dptse_env
 from hatch_build import for_package_page
+from scripts.dptse import MODULES
 from tests.helpers import ROOT
 
 PAGES = sorted(ROOT.glob("*.md"))
@@ -50,6 +51,20 @@ def test_what_docstrings_refer_to_is_there():
         for name in re.findall(r"`(dptse_env(?:\.\w+)+)`", path.read_text(encoding="utf-8")):
             if name != "dptse_env.plugins":  # the group of entry points
                 pkgutil.resolve_name(name)
+
+
+def test_the_page_on_architecture_has_every_command_with_its_modules():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([\w-]+)[^|]*` \| `(\w+\.py)` \| (.*) \|$", page, re.MULTILINE)
+    scripts = {name: module.split(".")[1] + ".py" for name, module in MODULES.items()}
+    assert {name: script for name, script, _ in rows} == scripts
+    for _, script, work in rows:
+        modules = [name.replace(".", "/") for name in re.findall(r"`([\w.]+)`", work)]
+        folder = modules[0]
+        assert (ROOT / "scripts" / script).is_file()
+        for name in modules:
+            places = [ROOT / name, ROOT / f"{name}.py", ROOT / folder / f"{name}.py"]
+            assert any(place.exists() for place in places), name
 
 
 @pytest.mark.skipif(not (ROOT / "results").is_dir(), reason="a source archive has no results")
