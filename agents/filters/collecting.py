@@ -23,7 +23,7 @@ from agents.environments import make_vector, quietly
 from agents.filters.network import Roads
 from agents.filters.scenarios import Scenario
 from agents.play import record
-from dptse_env.estimators import Measurement
+from dptse_env.estimators import Measurement, Reading
 from dptse_env.estimators.recurrent_kernels import (
     N_FEATURES,
     N_LOOP_FEATURES,
@@ -59,7 +59,7 @@ class Episodes:
         sigma: Their deviations, (T, k, M, 2).
         centre: Speeds [km/h] that flows are centred at, (T, k, S).
         inputs: The model's inputs, (T, k, n_u).
-        told: What readings of loop detectors say (`Estimator.hear`), (T, k, S, 6).
+        told: The last readings of loop detectors, the fields of a `Reading`, (T, k, S, 6).
         truth: Density [veh/km] and speed [km/h], (T, k, S, 2).
     """
 
@@ -102,6 +102,9 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) 
         if scenario.section is not None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dptse-section-")))
             keywords["corridor"] = str(scenario.section.write(folder, library))
+            if scenario.section.calibrated:
+                fitted = dataclasses.asdict(scenario.section.parameters(library))
+                keywords["parameters"] = fitted
         env = make_vector(scenario.env, len(seeds), keywords)
         record(env.config.corridor, seeds, library)
         return _play(env, scenario)
@@ -164,7 +167,7 @@ class _Recorder:
         process = self._process
         if process.loops is not None:
             told = process.loops.heard(process.traffic_index[episodes], process.time[episodes])
-            self.told.append(_single(told))
+            self.told.append(_single(np.stack(told, axis=-1)))
         self._estimator.update(episodes, measured)
 
     def readings(self) -> AnyArray:
@@ -172,7 +175,7 @@ class _Recorder:
         if self.told:
             return np.stack(self.told)
         process, T = self._process, len(self.inputs)
-        shape = T, process.n_episodes, process.model.n_segments, 6
+        shape = T, process.n_episodes, process.model.n_segments, len(Reading._fields)
         return np.broadcast_to(np.float32(0.0), shape)
 
     def __call__(self) -> None:
@@ -229,13 +232,16 @@ class Batch:
         parts = [part for part in self._parts if part.is_taught]
         return Batch(parts) if parts else None
 
-    def features(self, t: int, predicted: FloatArray, age: FloatArray) -> Tensor:
+    def features(
+        self, t: int, predicted: FloatArray, age: FloatArray, course: FloatArray
+    ) -> Tensor:
         """Return the features of second t + 1, shape (C, `N_INPUTS`).
 
         Args:
             t: Index of the second.
             predicted: Prediction of that second with its deviations, shape (C, 4).
             age: Seconds since the last measurement, shape (C,); updated.
+            course: Sums over predictions since the last reading, shape (C, 5); updated.
         """
         x = np.empty((len(age), N_INPUTS), dtype=np.float32)
         for part, place in zip(self._parts, self._places, strict=True):
@@ -245,6 +251,7 @@ class Batch:
                 present=predicted[place].reshape(k, -1, 4),
                 age=age[place].reshape(k, -1),
                 told=part.told[t],
+                course=course[place].reshape(k, -1, course.shape[1]),
                 innovations=np.empty(part.sigma[t].shape),
             )
             measured = Measurement(part.observed[t], part.values[t], part.sigma[t], part.centre[t])

@@ -46,6 +46,8 @@ STATIONS, INTERVALS = (0.3, 2.0), (10, 20, 30, 60, 120, 300)
 """Range of the distance of loop detectors [km], drawn log-uniformly, and their intervals [s]."""
 MISJUDGED = 0.3
 """Deviation of the logarithm of a section's published demand, in half of them."""
+CALIBRATED = 0.6
+"""Share of sections whose estimators are given parameters that were fitted to them."""
 LITTLE_NOISE, HARDLY_ANY, NONE = 0.25, 1000.0, 1e4
 """Share of scenarios whose epsilon is larger, up to this one, or in one of five none at all."""
 DELTAS = (0.05, 0.001)
@@ -253,6 +255,7 @@ class ScenarioRanges:
             kind=kind,
             loops=loops,
             misjudged=round(misjudged, 3),
+            calibrated=bool(rng.random() < CALIBRATED),
         )
 
 

@@ -12,11 +12,15 @@ from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
+from scipy.optimize import least_squares
 
 from agents.filters.highways import DURATION, WARM_UP, Highway, draw_highway
 from agents.filters.highways import Kind as HighwayKind
+from agents.fitting.parameters import slowed, start_from, traffic_of
+from dptse_env.estimators.tuned import DEFAULT_PARAMETERS
 from dptse_env.importers.folder import ROAD
 from dptse_env.importers.measured import measure
+from dptse_env.model import ARZParameters, load_parameters
 from dptse_env.traffic import Conditions, Corridor, Loops, Record, RecordLibrary, Scales
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.imported import Kind, save_records
@@ -25,6 +29,8 @@ from dptse_env.utils.arrays import FloatArray, IntArray
 
 SEGMENTS = (5, 60)
 """Range of the number of segments of a section."""
+POINTS = 37
+"""Of so many pairs of a density and a speed one is fitted."""
 CANDIDATES, FREE = 24, 0.3
 """Windows among which those of a section are drawn, and the weight of one without queues."""
 FILLED = 300
@@ -51,6 +57,7 @@ class Section:
             is its own one, too. Where there are none, all windows are of seed 0.
         loops: Loop detectors on the section; None for none.
         misjudged: Published demand over the measured one.
+        calibrated: Whether estimators are given parameters that were fitted to it (`parameters`).
     """
 
     highway: int
@@ -64,6 +71,7 @@ class Section:
     traffic: tuple[int, ...] = ()
     loops: Loops | None = None
     misjudged: float = 1.0
+    calibrated: bool = False
 
     def write(self, folder: Path, library: RecordLibrary) -> Path:
         """Write its road file and records to a folder, and return the path of the file.
@@ -101,6 +109,34 @@ class Section:
         kept = save_records(folder, road, cuts, sources, kind)
         write_corridor(folder / ROAD, road.replaced(recordings=kept))
         return folder / ROAD
+
+    def parameters(self, library: RecordLibrary) -> ARZParameters:
+        """Return parameters whose equilibrium speeds are those of its highway, within 3 %.
+
+        What a search of parameters finds lies near them, and takes a thousand times as long.
+        """
+        corridor = draw_highway(self.highway, self.kind).corridor
+        start = start_from(load_parameters(DEFAULT_PARAMETERS), corridor, "fitted")
+        density, speed = traffic_of(corridor, [0], library)
+        inside = np.s_[WARM_UP:, : corridor.geometry.n_mainline]
+        rho, v = density[inside].reshape(-1), speed[inside].reshape(-1)
+        rho, v = rho[rho > 0.0][::POINTS], v[rho > 0.0][::POINTS]
+        jam = start.jam_density / start.lanes
+
+        def lacking(x: FloatArray) -> FloatArray:
+            errors: FloatArray = x[0] * (1.0 - np.minimum(rho / jam / x[2], 1.0) ** x[1]) - v
+            return errors
+
+        first, low, high = (start.free_flow_speed, 1.0, 1.0), (20.0, 0.3, 0.6), (200.0, 4.0, 1.6)
+        found = least_squares(lacking, first, bounds=(low, high), loss="soft_l1", f_scale=10.0).x
+        rng = np.random.default_rng([80, self.highway, self.seed])
+        fitted = dataclasses.replace(
+            start,
+            free_flow_speed=float(found[0] * np.exp(rng.normal(0.0, 0.03))),
+            gamma=float(found[1]),
+            jam_density=float(found[2] * start.jam_density),
+        )
+        return slowed(fitted, corridor)
 
     def _place(self, highway: Corridor, record: Record) -> tuple[int, list[int]]:
         """Return a first segment and the starts of windows, drawn preferably with queues."""

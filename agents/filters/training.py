@@ -47,25 +47,27 @@ class State(NamedTuple):
     hidden: Tensor  # (C, H)
     predicted: FloatArray  # of the next second, with deviations, (C, 4)
     age: FloatArray  # seconds since the last measurement of each cell, (C,)
+    course: FloatArray  # `Memory.course`, (C, 5)
 
 
 def _begin(batch: Batch, width: int) -> State:
     """Return the state before the first second."""
     n = len(batch.start)
-    return State(torch.zeros(n, width), batch.start, np.full(n, LONGEST_AGE))
+    age, course = np.full(n, LONGEST_AGE), np.zeros((n, 5))
+    return State(torch.zeros(n, width), batch.start, age, course)
 
 
 def _advance(
     network: RecurrentNetwork, batch: Batch, window: range, state: State
 ) -> tuple[State, Tensor, Tensor]:
     """Return the state after some seconds, and the estimates of them and of the next ones."""
-    (hidden, predicted, age), kept = state, []
+    (hidden, predicted, age, course), kept = state, []
     hidden = hidden.detach()
     for t in window:
-        hidden = network(batch.roads, batch.features(t, predicted, age), hidden)
+        hidden = network(batch.roads, batch.features(t, predicted, age, course), hidden)
         predicted = network.read(batch.roads, hidden.detach())[1].detach().numpy().astype(float)
         kept.append(hidden)
-    return State(hidden, predicted, age), *network.read(batch.roads, torch.stack(kept))
+    return State(hidden, predicted, age, course), *network.read(batch.roads, torch.stack(kept))
 
 
 class FilterTraining(TrainingFolder):

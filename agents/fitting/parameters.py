@@ -92,10 +92,15 @@ def start_from(shipped: ARZParameters, corridor: Corridor, name: str) -> ARZPara
         lanes=lanes,
         derived_from=shipped.name,
     )
-    while not is_stable(start, corridor):
-        slower, flatter = 0.97 * start.free_flow_speed, 0.97 * start.gamma
-        start = dataclasses.replace(start, free_flow_speed=slower, gamma=flatter)
-    return start
+    return slowed(start, corridor)
+
+
+def slowed(parameters: ARZParameters, corridor: Corridor) -> ARZParameters:
+    """Return a set, slowed down until its CFL condition holds on a road."""
+    while not is_stable(parameters, corridor):
+        slower, flatter = 0.97 * parameters.free_flow_speed, 0.97 * parameters.gamma
+        parameters = dataclasses.replace(parameters, free_flow_speed=slower, gamma=flatter)
+    return parameters
 
 
 def is_stable(parameters: ARZParameters, corridor: Corridor) -> bool:

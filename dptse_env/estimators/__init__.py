@@ -10,6 +10,7 @@ from dptse_env.estimators.base import (
     KernelEstimator,
     Measurement,
     Played,
+    Reading,
 )
 from dptse_env.estimators.settings import (
     AdaptiveSmoothingSettings,
@@ -43,6 +44,7 @@ __all__ = [
     "Measurement",
     "MixtureSettings",
     "Played",
+    "Reading",
     "RecurrentSettings",
     "SigmaPointSettings",
     "check_estimator",

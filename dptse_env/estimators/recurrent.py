@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from dptse_env.estimators.base import Played, SegmentEstimator
+from dptse_env.estimators.base import Played, Reading, SegmentEstimator
 from dptse_env.estimators.recurrent_kernels import (
     FEATURES,
     LONGEST_AGE,
@@ -32,12 +32,12 @@ from dptse_env.estimators.recurrent_kernels import (
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
-from dptse_env.utils.arrays import AnyArray, FloatArray, IntArray
+from dptse_env.utils.arrays import AnyArray, IntArray
 from dptse_env.utils.files import read_tensors, require_arrays, write_tensors
 from dptse_env.utils.kernels import Bundle
 
 LARGEST_WIDTH = 512
-FORMAT = "recurrent-2"
+FORMAT = "recurrent-3"
 """Name of the features' order and meaning; another one is refused."""
 
 SHIPPED = ("highway", "long-highway", "roads")
@@ -69,11 +69,13 @@ class Recurrent(SegmentEstimator):
         flows = model.releases_flow
         self.saved = weights_for(settings.recurrent.weights, model.road, flows)
         S, n = model.n_segments, n_episodes
+        heard = S if self.hears_loops else 0
         memory = Memory(
             inputs=np.zeros((n, model.n_inputs)),
             present=self.present,
             age=np.full((n, S), LONGEST_AGE),
-            told=np.zeros((n, S, 6)),
+            told=np.zeros((n, heard, len(Reading._fields))),
+            course=np.zeros((n, heard, 5)),
             innovations=self.innovations,
         )
         state = State(
@@ -92,8 +94,8 @@ class Recurrent(SegmentEstimator):
     def _memory(self) -> tuple[AnyArray, ...]:
         _, _, _, memory, _, state = self.arrays.parts
         return (
-            memory.inputs, memory.present, memory.age, memory.told, state.hidden, state.ahead,
-            state.priors,
+            memory.inputs, memory.present, memory.age, memory.told, memory.course, state.hidden,
+            state.ahead, state.priors,
         )  # fmt: skip
 
     @property
@@ -101,9 +103,9 @@ class Recurrent(SegmentEstimator):
         """True where its weights have readings of loops among their features."""
         return self.saved.weights.hears_loops
 
-    def hear(self, episodes: IntArray, told: FloatArray) -> None:
+    def hear(self, episodes: IntArray, told: Reading) -> None:
         """Take what the last readings say, for the next update."""
-        self.arrays.parts[3].told[episodes] = told
+        self.arrays.parts[3].told[episodes] = np.stack(told, axis=-1)
 
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:

@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators.base import Measurement
-from dptse_env.model import ARZModel
+from dptse_env.model import ARZ, ARZModel
 from dptse_env.model.step import clip
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, all_finite, inline_part, kernel, kernel_part
@@ -46,16 +46,17 @@ FEATURES = (
     "predicted_speed", "log_density_deviation", "log_speed_deviation", "density_innovation",
     "second_innovation", "density_correction", "density_correction_by_flow", "speed_correction",
     "density_gain", "speed_gain", "slip", "flows", "log_age", "inflow", "outside_density",
-    "on_ramp", "off_ramp", "entry", "exit", "lanes", "log_length", "log_limit",
+    "on_ramp", "off_ramp", "entry", "exit", "lanes", "log_length", "log_limit", "equilibrium_speed",
 )  # fmt: skip
 """The features of a cell."""
 N_FEATURES = len(FEATURES)
 LOOP_FEATURES = (
-    "told", "told_density", "told_speed", "log_told_density_deviation", "log_told_speed_deviation",
-    "log_told_age", "log_interval",
+    "told", "told_density", "told_speed", "log_told_age", "log_interval", "mean_density_correction",
+    "mean_speed_correction", "mean_density_gain", "mean_speed_gain",
 )  # fmt: skip
 """Further features of a cell beside a station of loop detectors, in networks that hear of them:
-that there is a reading, what it says of the cell, and how old and how long its interval is."""
+that there is a reading, what it says of the cell, how old and how long its interval is, and, in the
+second in which it comes, corrections and gains of the mean of the predictions in that interval."""
 N_LOOP_FEATURES = len(LOOP_FEATURES)
 
 LONGEST_AGE = 300.0
@@ -94,6 +95,7 @@ class Cells(NamedTuple):
     limit: float  # largest speed limit [km/h], the unit of speeds
     flows: bool  # whether flows are released, otherwise speeds
     fixed: FloatArray  # (S, N_FIXED) features
+    arz: ARZ  # numbers of the traffic model, whose equilibrium speed is a feature
     hears_loops: bool  # whether `LOOP_FEATURES` follow
 
 
@@ -113,6 +115,7 @@ def make_cells(model: ARZModel, hears_loops: bool = False) -> Cells:
         limit=float(limits.max()),
         flows=model.releases_flow,
         fixed=np.concatenate([marks, lanes[:, None] / 3.0, scales], axis=1),
+        arz=model.arz,
         hears_loops=hears_loops,
     )
 
@@ -162,9 +165,8 @@ class Memory(NamedTuple):
     inputs: FloatArray  # (n, n_u) the model's inputs of the last prediction
     present: FloatArray  # (n, S, 4) predictions, then estimates, and their deviations
     age: FloatArray  # (n, S) seconds since the last measurement
-    # (n, S, 6) density, speed, deviations of both, age of the middle of the interval and its length
-    # [s], of the last reading; 0 where there is none
-    told: FloatArray
+    told: FloatArray  # (n, S, 6) the last `Reading` of cells; without cells if none is heard
+    course: FloatArray  # (n, S, 5) sums of predictions and their variances since, and their number
     innovations: FloatArray  # (n, M, 2)
 
 
@@ -191,7 +193,7 @@ def _restart(memory: Memory, state: State, e: int) -> None:
     memory.present[e] = state.priors[e]
     state.ahead[e] = state.priors[e]
     memory.age[e] = LONGEST_AGE
-    memory.told[e] = 0.0
+    memory.told[e], memory.course[e] = 0.0, 0.0
     memory.innovations[e] = 0.0
 
 
@@ -227,14 +229,14 @@ def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Ar
     """Write the features of all cells, and innovations; update the ages of measurements.
 
     Args:
-        bundle: Road, channels, `Cells` and `Memory`, whose age and innovations are updated; more
-            parts may follow.
+        bundle: Road, channels, `Cells` and `Memory`, whose age, course and innovations are
+            updated; more parts may follow.
         episodes: Shape (k,).
         measured: The release of the k episodes.
         x: Output, shape (k, S, C or more).
     """
     road, channels, cells, memory = bundle.parts[:4]
-    inputs, present, age, told, innovations = memory
+    inputs, present, age, told, course, innovations = memory
     S = road.n_segments
     sums, second = np.empty((S, 10)), np.empty((S, 4))
     outside = np.empty((S, 2))
@@ -266,9 +268,21 @@ def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Ar
             row[18], row[19] = outside[s, 0], outside[s, 1]
             for j in range(N_FIXED):
                 row[20 + j] = cells.fixed[s, j]
+            row[27] = _equilibrium_speed(cells.arz, s, prior[s, 0]) / cells.limit
             if cells.hears_loops:
-                _write_told(told[episode, s], cells.unit[s], cells.limit, row[N_FEATURES:])
+                _write_told(
+                    told[episode, s], prior[s], course[episode, s], cells.unit[s], cells.limit,
+                    row[N_FEATURES:],
+                )  # fmt: skip
             age[episode, s] = 0.0 if sums[s, 0] > 0.0 else age[episode, s] + 1.0
+
+
+@kernel_part
+def _equilibrium_speed(arz: ARZ, s: int, density: float) -> float:
+    """Return V_e = v_f (1 - (rho / rho_m)^gamma), at which traffic of a density settles."""
+    share = min(max(density, 0.0) / arz.jam[s], 1.0)
+    speed: float = arz.free_flow_speed * (1.0 - share**arz.gamma)
+    return speed
 
 
 @inline_part
@@ -345,14 +359,35 @@ def _write(
 
 
 @inline_part
-def _write_told(told: FloatArray, unit: float, limit: float, row: Float32Array) -> None:
-    """Write `LOOP_FEATURES` of a cell; 0 where no reading says anything of it."""
+def _write_told(
+    told: FloatArray,
+    prior: FloatArray,
+    course: FloatArray,
+    unit: float,
+    limit: float,
+    row: Float32Array,
+) -> None:
+    """Write `LOOP_FEATURES` of a cell, 0 where no reading says anything of it; update its course.
+
+    A reading is of a mean, so it corrects the mean of what was predicted in its interval.
+    """
     row[:N_LOOP_FEATURES] = 0.0
-    if told[2] > 0.0:
+    age, interval = told[4], told[5]
+    for j in range(2):
+        course[j] += prior[j]
+        course[2 + j] += prior[2 + j] ** 2
+    course[4] += 1.0
+    if interval > 0.0:
         row[0], row[1], row[2] = 1.0, told[0] / unit, told[1] / limit
-        row[3] = 0.25 * np.log(told[2] / unit)
-        row[4] = 0.25 * np.log(min(told[3] / limit, LARGEST_CORRECTION))
-        row[5], row[6] = 0.25 * np.log(1.0 + told[4]), 0.25 * np.log(told[5])
+        row[3], row[4] = 0.25 * np.log(1.0 + age), 0.25 * np.log(interval)
+        if age == 0.0:
+            for j in range(2):
+                mean, variance = course[j] / course[4], course[2 + j] / course[4]
+                gain = variance / (variance + told[2 + j] ** 2)
+                scale = unit if j == 0 else limit
+                row[5 + j] = 4.0 * _correction(gain * (told[j] - mean) / scale)
+                row[7 + j] = gain
+            course[:] = 0.0
 
 
 @kernel_part

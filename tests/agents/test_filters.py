@@ -266,10 +266,10 @@ class Seen:
 def steps(network, batch, n):
     """Yield hidden states and the estimates of the second, for `n` seconds."""
     age, predicted = np.full(len(batch.start), LONGEST_AGE), batch.start
-    hidden = torch.zeros(len(age), network.width)
+    hidden, course = torch.zeros(len(age), network.width), np.zeros((len(age), 5))
     for t in range(n):
         with torch.no_grad():
-            hidden = network(batch.roads, batch.features(t, predicted, age), hidden)
+            hidden = network(batch.roads, batch.features(t, predicted, age, course), hidden)
             present, ahead = network.read(batch.roads, hidden)
         predicted = ahead.numpy().astype(float)
         yield hidden.numpy(), present.numpy()

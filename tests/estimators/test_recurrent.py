@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from dptse_env.estimators import Measurement
+from dptse_env.estimators import Measurement, Reading
 from dptse_env.estimators.recurrent import (
     member_for,
     outside,
@@ -40,7 +40,7 @@ def of_weights(episodes, folder, weights=None, **ranges):
 # Beside the network that is trained ---------------------------------------------------------------
 
 
-def features(model, measured, inputs, prior, age, told=None):
+def features(model, measured, inputs, prior, age, told=None, course=()):
     """The features and innovations of one episode, as the module's docstring has them.
 
     All rows and cells are treated at once.
@@ -51,7 +51,8 @@ def features(model, measured, inputs, prior, age, told=None):
         inputs: The model's inputs, shape (n_u,).
         prior: Predictions and deviations, shape (S, 4).
         age: Seconds since the last measurement of each cell, shape (S,).
-        told: What readings of loop detectors say, shape (S, 6); None for no such features.
+        told: The last readings of loop detectors, arrays (S,); None for no such features.
+        course: The predictions since those before; updated.
     """
     cells, flows = make_cells(model), float(model.centre is not None)
     observed, values, sigma, centre = (part[0] for part in measured)
@@ -91,16 +92,21 @@ def features(model, measured, inputs, prior, age, told=None):
         np.minimum(by_speed**2 * P_v * (1 / V_y @ H**2), 1.0),
         slip / limit, np.full(len(v), flows), 0.25 * np.log(1.0 + np.minimum(age, LONGEST_AGE)),
         *outside, *cells.fixed.T,
+        np.maximum(model.parameters.free_flow_speed - model.pressure(rho), 0.0) / limit,
     ]  # fmt: skip
     if told is not None:
-        there, (density, speed, density_std, speed_std, since, interval) = told[:, 2] > 0, told.T
+        course.append(prior)
+        there, comes = told.interval > 0, (told.interval > 0) & (told.age == 0)
+        mean, variance = np.mean(course, axis=0).T[:2], np.mean(np.square(course), axis=0).T[2:]
+        read = np.stack(told[:2])
+        gain = variance / (variance + np.square(told[2:4]))
+        lacking = 4 * held(gain * (read - mean) / np.stack([unit, np.full(len(v), limit)]), 2.0)
         with np.errstate(divide="ignore"):
-            further = [
-                there, density / unit, speed / limit, 0.25 * np.log(density_std / unit),
-                0.25 * np.log(np.minimum(speed_std / limit, 2.0)), 0.25 * np.log(1.0 + since),
-                0.25 * np.log(interval),
-            ]  # fmt: skip
-        numbers += [np.where(there, each, 0.0) for each in further]
+            last = [read[0] / unit, read[1] / limit, *0.25 * np.log((1 + told.age, told.interval))]
+        numbers += [np.where(there, each, 0.0) for each in (1.0, *last)]
+        numbers += [np.where(comes, each, 0.0) for each in (*lacking, *gain)]
+        if comes.any():  # all of an episode at once
+            course.clear()
     age[:] = np.where(n > 0, 0.0, age + 1.0)
     return np.stack(numbers, axis=-1), innovations
 
@@ -130,13 +136,17 @@ class Twin:
         self.ahead = np.stack([said.density, said.speed, said.density_std, said.speed_std], -1)
         self.hidden = torch.zeros(n * S, self.network.width)
         self.age = np.full(self.ahead.shape[:2], LONGEST_AGE)
+        self.courses = [[] for _ in range(n)]
 
     def step(self, inputs, given, told=None):
         """Return the estimates and deviations after a step, and before the next `(n, S, 4)`."""
-        told = [None] * len(self.ahead) if told is None else told
+        n = len(self.ahead)
+        told = (
+            [None] * n if told is None else [Reading(*(each[k] for each in told)) for k in range(n)]
+        )
         both = [
             features(self.model, [part[k : k + 1] for part in given], inputs[k], *prior)
-            for k, prior in enumerate(zip(self.ahead, self.age, told, strict=True))
+            for k, prior in enumerate(zip(self.ahead, self.age, told, self.courses, strict=True))
         ]
         x, self.innovations = (np.stack(each) for each in zip(*both, strict=True))
         with torch.no_grad():
@@ -175,11 +185,14 @@ def test_it_is_the_network_that_is_trained(release, width, noise, hears_loops, t
     estimator = of_weights(episodes, tmp_path, random_weights(width, hears_loops))
     assert estimator.hears_loops == hears_loops
     twin, far, told = Twin(estimator), [], None
-    rng, shape = np.random.default_rng(1), (3, episodes.model.n_segments, 6)
+    rng, shape = np.random.default_rng(1), (3, episodes.model.n_segments)
+    beside = rng.random(shape) < 0.5
     for k in range(40):
         if hears_loops:
-            told = rng.uniform(1.0, 200.0, shape) * (rng.random(shape[:2]) < 0.5)[..., None]
-            told[0, 0, 3] = 1e5
+            said = rng.uniform(1.0, 200.0, (4, *shape))
+            said[3, 0, 0] = 1e5
+            interval = np.where(beside & (k >= 10), 10.0, 0.0)
+            told = Reading(*said, np.full(shape, k % 10.0), interval)
             estimator.hear(episodes.everyone, told)
         step(estimator, episodes, k)
         given = Measurement.of(episodes.model, **episodes.released(k, episodes.everyone))

@@ -234,6 +234,7 @@ def test_a_network_hears_what_the_last_interval_said(tmp_path):
         assert told.any() == (second >= 20)
     read = process.traffic.readings[process.traffic_index, 1]
     beside, said = np.unique(process.config.corridor.stations.beside), process.loops.said(read)
-    np.testing.assert_allclose(told[:, beside, :4], np.stack(said[:4], axis=-1))
-    np.testing.assert_array_equal(told[:, beside, 4:], np.full((2, len(beside), 2), (15.0, 20.0)))
+    np.testing.assert_allclose(told[:, beside, :2], np.stack(said[:2], axis=-1))
+    np.testing.assert_allclose(told[:, beside, 2], said.density_shared)
+    np.testing.assert_array_equal(told[:, beside, 4:], np.full((2, len(beside), 2), (5.0, 20.0)))
     assert not told[:, np.setdiff1d(np.arange(told.shape[1]), beside)].any()
