@@ -43,6 +43,8 @@ NAME = "weights"
 """Name of the pair of weights in the output folder."""
 CONTINUED: dict[str, Any] = {"learning_rate": 1.5e-3, "teacher": 0.5, "checkpoint_every": 160}
 """Fields of a plan that begins with trained weights."""
+TEACHER = "highway"
+"""Pair of weights that teaches where `roads` are the initial ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +96,9 @@ def make_plan(args: Args, kind: Kind, seed: int) -> FilterPlan:
     traffic, initial = parse_seeds(args.train_seeds, "train_seeds"), None
     width, continued = FilterPlan.width, {}
     if args.initial is not None:
-        initial, continued = member_for(args.initial, kind == "flows"), CONTINUED
+        initial, continued = member_for(args.initial, kind == "flows"), {**CONTINUED}
+        if args.initial == Args.initial:
+            continued["teacher_weights"] = member_for(TEACHER, kind == "flows")
         with within("initial: "):
             width = read_weights(initial).weights.width
     ranges = ScenarioRanges(envs=args.env) if args.env else ScenarioRanges()

@@ -124,8 +124,9 @@ class FilterPlan:
         checkpoint_every: Passes between checkpoints.
         initial: Weights that the training begins with, a name or a file; None to draw them at
             random.
-        teacher: Share of the loss on ordinary roads that is the distance from the estimates of the
-            initial weights.
+        teacher: Share of the loss on ordinary roads that is the distance from the estimates of a
+            teacher, where its card has such roads.
+        teacher_weights: Weights of the teacher, a name or a file; the initial ones if None.
 
     Raises:
         ValueError: A value is out of range.
@@ -147,6 +148,7 @@ class FilterPlan:
     checkpoint_every: Annotated[int, Interval(1, 1_000_000)] = 64
     initial: str | None = None
     teacher: Annotated[float, Interval(0, 1)] = 0.0
+    teacher_weights: str | None = None
 
     def __post_init__(self) -> None:
         """Check values."""
@@ -167,8 +169,10 @@ class FilterPlan:
                 "rounds must begin with one of another estimator where no initial weights are "
                 "given, since the network knows nothing yet"
             )
-        taught = self.initial is not None or self.teacher == 0.0
-        require(taught, "teacher", "0 without initial weights", self.teacher)
+        if self.teacher_weights is None:
+            object.__setattr__(self, "teacher_weights", self.initial)
+        taught = self.teacher_weights is not None or self.teacher == 0.0
+        require(taught, "teacher", "0 without weights that teach", self.teacher)
         if self.initial is not None:
             width = read_weights(self.initial).weights.width
             allowed = f"that of the initial weights, {width}"

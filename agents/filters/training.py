@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +20,7 @@ from agents.filters.network import RecurrentNetwork, second_loss, teacher_loss
 from agents.filters.plan import OWN, FilterPlan, played_by
 from agents.play import play
 from agents.training.run_files import Row, TrainingFolder
-from dptse_env.estimators.recurrent import read_weights, write_weights
+from dptse_env.estimators.recurrent import outside, read_weights, write_weights
 from dptse_env.estimators.recurrent_kernels import LONGEST_AGE
 from dptse_env.importers.folder import ROAD, new_folder
 from dptse_env.traffic import Records, open_library
@@ -107,7 +108,12 @@ class FilterTraining(TrainingFolder):
             self.network.take(read_weights(plan.initial).weights)
         self._optimiser = torch.optim.Adam(self.network.parameters(), plan.learning_rate)
         self._average = copy.deepcopy(self.network)
-        self._teacher = copy.deepcopy(self.network) if plan.teacher > 0.0 else None
+        self._taught_by = read_weights(plan.teacher_weights) if plan.teacher_weights else None
+        self._teacher = None
+        if self._taught_by is not None and plan.teacher > 0.0:
+            weights = self._taught_by.weights
+            self._teacher = RecurrentNetwork(weights.width, weights.hears_loops)
+            self._teacher.take(weights)
         self.done, self._seconds = 0, 0.0
         if self.checkpoint is not None:
             self.network.load_state_dict(self.checkpoint["network"])
@@ -136,7 +142,13 @@ class FilterTraining(TrainingFolder):
         name = self.plan.rounds[index].estimator
         estimator = played_by(self.folder / PLAYED) if name == OWN else {"estimator": name}
         work = partial(collect, estimator=estimator, records=self._records)
-        return run_in_order(self._executor, work, self.plan.scenarios(index), progress=False)
+        found = run_in_order(self._executor, work, self.plan.scenarios(index), progress=False)
+        return [replace(each, is_taught=each.is_taught and self._knows(each)) for each in found]
+
+    def _knows(self, episodes: Episodes) -> bool:
+        """Return whether the teacher was trained on roads like that of some episodes."""
+        saved, flows = self._taught_by, float(self.plan.kind == "flows")
+        return saved is not None and not outside(saved, episodes.corridor.road, {"flows": (flows,)})
 
     def _pass(self, index: int, collected: Sequence[Episodes]) -> Row:
         """Pass over some episodes, drawn from all scenarios; return the row of the curve."""
@@ -147,7 +159,9 @@ class FilterTraining(TrainingFolder):
         rng = np.random.default_rng([plan.seed, 2**31, self.done])
         batch = draw_batch(rng, collected, plan.episodes)
         taught = batch.taught if self._teacher is not None else None
-        states = [_begin(each, plan.width) for each in (batch, taught) if each is not None]
+        states = [_begin(batch, plan.width)]
+        if taught is not None and self._teacher is not None:
+            states.append(_begin(taught, self._teacher.width))
         losses, errors = [], []
         for first in range(0, plan.seconds, WINDOW):
             window = range(first, min(first + WINDOW, plan.seconds))

@@ -469,7 +469,7 @@ def test_a_training_may_begin_with_other_weights_and_says_so_on_the_card(tmp_pat
         ({"rounds": (Round(OWN, 1, 1),)}, "rounds must begin with one of another estimator"),
         ({"rounds": ()}, "rounds must begin"),
         ({"windows": 4}, r"windows must be an integer in 1\.\.3, got 4"),
-        ({"teacher": 0.5}, "teacher must be 0 without initial weights, got 0.5"),
+        ({"teacher": 0.5}, "teacher must be 0 without weights that teach, got 0.5"),
         ({"kind": "densities"}, "kind must be one of flows, speeds, got 'densities'"),
         ({"validation_highways": (5, 9)}, r"validation_highways must be .* outside of \(0, 80\)"),
         ({"initial": "nowhere"}, r"weights must be a file or one of highway, .*, got 'nowhere'"),
