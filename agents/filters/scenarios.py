@@ -46,6 +46,8 @@ STATIONS, INTERVALS = (0.3, 2.0), (10, 20, 30, 60, 120, 300)
 """Range of the distance of loop detectors [km], drawn log-uniformly, and their intervals [s]."""
 MISJUDGED = 0.3
 """Deviation of the logarithm of a section's published demand, in half of them."""
+SHARES = 0.16, 0.36, 0.16, 0.16, 0.16
+"""Shares of `KINDS` but the first: a load that moves, one half of the convoys, is learnt slowly."""
 CALIBRATED = 0.6
 """Share of sections whose estimators are given parameters that were fitted to them."""
 LITTLE_NOISE, HARDLY_ANY, NONE = 0.25, 1000.0, 1e4
@@ -145,9 +147,9 @@ class ScenarioRanges:
     """
 
     envs: tuple[str, ...] = ROADS
-    sections: Annotated[float, Interval(0, 1)] = 0.5
+    sections: Annotated[float, Interval(0, 1)] = 0.6
     highways: tuple[int, int] = (0, 80)
-    free: Annotated[float, Interval(0, 1)] = 0.5
+    free: Annotated[float, Interval(0, 1)] = 0.6
     loops: Annotated[float, Interval(0, 1)] = 0.3
     connected: Annotated[float, Interval(0, 1)] = 0.3
     schedules: tuple[str, ...] = SCHEDULES
@@ -230,7 +232,7 @@ class ScenarioRanges:
     ) -> Section:
         kind: HighwayKind = "queues"
         if rng.random() < self.free:
-            kind = KINDS[int(rng.integers(1, len(KINDS)))]
+            kind = KINDS[1:][int(rng.choice(len(SHARES), p=SHARES))]
         number = int(rng.choice(numbers_of(kind, self.highways)))
         whole = draw_highway(number, kind).corridor.geometry
         most = min(whole.n_mainline - 2, SEGMENTS[1])
