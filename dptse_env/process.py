@@ -83,7 +83,7 @@ class QueryProcess:
         fusion: Turns releases into measurements of all vehicles; None where they are these.
         loops: Readings of loops; None where there are none.
         rewind: Takes the estimator back to where an interval began, with its readings; None where
-            there are no loops, or the estimator hears of them itself.
+            there are no loops.
         n_episodes: Size of the batch.
         time: Second of the record that each episode stands at, shape (n,).
         start: Second that it began at, below 0 before its first reset, shape (n,).
@@ -146,8 +146,7 @@ class QueryProcess:
         self.loops, self.rewind = None, None
         if config.corridor.loops is not None:
             self.loops = LoopReadings(task, self.traffic)
-            if not self.estimator.hears_loops:
-                self.rewind = Rewind(self.loops, self.estimator, task, self._threads)
+            self.rewind = Rewind(self.loops, self.estimator, task, self._threads)
         self._checks_estimates = is_foreign(self.estimator)
         self._checks_releases = is_foreign(self.release)
         self._checks_decisions = is_foreign(self.interface.actions)
@@ -325,8 +324,6 @@ class QueryProcess:
         request = Request(episodes, traffic, self.time[episodes], observed, prediction)
         measured = self.measure(request)
         self.boundary.update(episodes, measured)
-        if self.loops is not None and self.rewind is None:
-            self.estimator.hear(episodes, self.loops.heard(traffic, self.time[episodes]))
         self._threads.run(self.estimator.update, episodes, measured, Measurement.at)
         if self.rewind is not None:
             self.rewind.follow(episodes, traffic, self.time[episodes], inputs, measured)

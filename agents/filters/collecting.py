@@ -23,10 +23,9 @@ from agents.environments import make_vector, quietly
 from agents.filters.network import Roads
 from agents.filters.scenarios import Scenario
 from agents.play import record
-from dptse_env.estimators import Measurement, Reading
+from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent_kernels import (
     N_FEATURES,
-    N_LOOP_FEATURES,
     Cells,
     Memory,
     make_cells,
@@ -39,9 +38,6 @@ from dptse_env.traffic import Corridor, Records, open_library
 from dptse_env.utils.arrays import AnyArray, FloatArray
 from dptse_env.utils.kernels import Bundle
 from dptse_env.vector_env import SensorQueryVectorEnv
-
-N_INPUTS = N_FEATURES + N_LOOP_FEATURES
-"""Features of a network that is trained; one without those of loops reads the first of them."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +55,6 @@ class Episodes:
         sigma: Their deviations, (T, k, M, 2).
         centre: Speeds [km/h] that flows are centred at, (T, k, S).
         inputs: The model's inputs, (T, k, n_u).
-        told: The last readings of loop detectors, the fields of a `Reading`, (T, k, S, 6).
         truth: Density [veh/km] and speed [km/h], (T, k, S, 2).
     """
 
@@ -73,12 +68,11 @@ class Episodes:
     sigma: AnyArray
     centre: AnyArray
     inputs: AnyArray
-    told: AnyArray
     truth: AnyArray
 
     def pick(self, chosen: AnyArray) -> Episodes:
         """Return some of the episodes, in double precision."""
-        names = ("observed", "values", "sigma", "centre", "inputs", "told", "truth")
+        names = ("observed", "values", "sigma", "centre", "inputs", "truth")
         arrays = {name: getattr(self, name)[:, chosen] for name in names}
         doubles = {name: arrays[name].astype(float) for name in names[1:]}
         start = self.start[chosen].astype(float)
@@ -128,14 +122,13 @@ def _play(env: SensorQueryVectorEnv, scenario: Scenario) -> Episodes:
         corridor=process.config.corridor,
         is_taught=scenario.is_taught,
         channels=process.model.channels,
-        cells=make_cells(process.model, hears_loops=True),
+        cells=make_cells(process.model),
         start=recorder.start,
         observed=observed,
         values=_single(values),
         sigma=_single(sigma),
         centre=_single(centre),
         inputs=_single(np.stack(recorder.inputs)),
-        told=recorder.readings(),
         truth=np.stack(recorder.truth),
     )
 
@@ -147,7 +140,6 @@ class _Recorder:
         self._estimator, self._process = process.estimator, process
         self.measured: list[tuple[AnyArray, ...]] = []
         self.inputs: list[FloatArray] = []
-        self.told: list[FloatArray] = []
         self.start: AnyArray = np.empty(0)
         self.truth: list[AnyArray] = []
 
@@ -164,19 +156,7 @@ class _Recorder:
         model = self._process.model
         own = measured.on_road(model.channels.size, model.n_segments)
         self.measured.append(tuple(array.copy() for array in own))
-        process = self._process
-        if process.loops is not None:
-            told = process.loops.heard(process.traffic_index[episodes], process.time[episodes])
-            self.told.append(_single(np.stack(told, axis=-1)))
         self._estimator.update(episodes, measured)
-
-    def readings(self) -> AnyArray:
-        """Return what readings said in all seconds; on a road without loops no memory is taken."""
-        if self.told:
-            return np.stack(self.told)
-        process, T = self._process, len(self.inputs)
-        shape = T, process.n_episodes, process.model.n_segments, len(Reading._fields)
-        return np.broadcast_to(np.float32(0.0), shape)
 
     def __call__(self) -> None:
         """Record the prior at the reset, and the truth of every second."""
@@ -232,31 +212,26 @@ class Batch:
         parts = [part for part in self._parts if part.is_taught]
         return Batch(parts) if parts else None
 
-    def features(
-        self, t: int, predicted: FloatArray, age: FloatArray, course: FloatArray
-    ) -> Tensor:
-        """Return the features of second t + 1, shape (C, `N_INPUTS`).
+    def features(self, t: int, predicted: FloatArray, age: FloatArray) -> Tensor:
+        """Return the features of second t + 1, shape (C, `N_FEATURES`).
 
         Args:
             t: Index of the second.
             predicted: Prediction of that second with its deviations, shape (C, 4).
             age: Seconds since the last measurement, shape (C,); updated.
-            course: Sums over predictions since the last reading, shape (C, 5); updated.
         """
-        x = np.empty((len(age), N_INPUTS), dtype=np.float32)
+        x = np.empty((len(age), N_FEATURES), dtype=np.float32)
         for part, place in zip(self._parts, self._places, strict=True):
             k = len(part.start)
             memory = Memory(
                 inputs=part.inputs[t],
                 present=predicted[place].reshape(k, -1, 4),
                 age=age[place].reshape(k, -1),
-                told=part.told[t],
-                course=course[place].reshape(k, -1, course.shape[1]),
                 innovations=np.empty(part.sigma[t].shape),
             )
             measured = Measurement(part.observed[t], part.values[t], part.sigma[t], part.centre[t])
             bundle = Bundle(part.corridor.road, part.channels, part.cells, memory)
-            read(bundle, np.arange(k), measured, x[place].reshape(k, -1, N_INPUTS))
+            read(bundle, np.arange(k), measured, x[place].reshape(k, -1, N_FEATURES))
         return torch.from_numpy(x)
 
 

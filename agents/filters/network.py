@@ -12,8 +12,6 @@ from dptse_env.estimators.recurrent_kernels import (
     DENSITY_RANGE,
     HIGHEST_SPREAD,
     LOWEST_SPREAD,
-    N_FEATURES,
-    N_LOOP_FEATURES,
     SPEED_RANGE,
     Weights,
     message_width,
@@ -49,11 +47,11 @@ class RecurrentNetwork(nn.Module):
     heads: Tensor
     heads_bias: Tensor
 
-    def __init__(self, width: int, hears_loops: bool = True) -> None:
+    def __init__(self, width: int) -> None:
         """Draw hidden weights as orthogonal matrices, the others at random."""
         super().__init__()
-        self.width, self.n_features = width, N_FEATURES + N_LOOP_FEATURES * hears_loops
-        for name, shape in shapes(width, hears_loops).items():
+        self.width = width
+        for name, shape in shapes(width).items():
             weights = torch.zeros(shape)
             if name == "inputs":
                 weights.uniform_(-1.0, 1.0).mul_(shape[0] ** -0.5)
@@ -74,8 +72,7 @@ class RecurrentNetwork(nn.Module):
 
         Args:
             roads: The cells.
-            x: Their features, as `recurrent_kernels.read` writes them, shape (C, its number of
-                features or more).
+            x: Their features, as `recurrent_kernels.read` writes them, shape (C, N_FEATURES).
             h: Hidden states before that second, shape (C, H).
         """
         H = self.width
@@ -84,7 +81,7 @@ class RecurrentNetwork(nn.Module):
         none = torch.zeros_like(messages)
         up = none.index_add(0, end, messages[start])
         down = none.index_add(0, start, messages[end])
-        g = torch.cat([x[..., : self.n_features], up, down], -1) @ self.inputs + self.inputs_bias
+        g = torch.cat([x, up, down], -1) @ self.inputs + self.inputs_bias
         q = h @ self.hidden + self.hidden_bias
         gates = torch.sigmoid(g[..., : 2 * H] + q[..., : 2 * H])
         z, r = gates[..., :H], gates[..., H:]
@@ -100,14 +97,10 @@ class RecurrentNetwork(nn.Module):
         return _outputs(roads, raw[..., :4]), _outputs(roads, raw[..., 4:])
 
     def take(self, weights: Weights) -> None:
-        """Take weights of the same width; of loops those that do not hear of them say nothing."""
+        """Take weights of the same width."""
         with torch.no_grad():
             for name, parameter in self.named_parameters():
-                array = getattr(weights, name)
-                if name == "inputs" and len(array) < len(parameter):
-                    silent = np.zeros((N_LOOP_FEATURES, array.shape[1]), dtype=array.dtype)
-                    array = np.insert(array, [N_FEATURES] * len(silent), silent, axis=0)
-                parameter.copy_(torch.from_numpy(array.copy()))
+                parameter.copy_(torch.from_numpy(getattr(weights, name).copy()))
 
     def weights(self) -> Weights:
         """Return the weights as arrays."""

@@ -34,7 +34,6 @@ from agents.filters.highways import Kind as HighwayKind
 from agents.filters.scenarios import (
     CONNECTED,
     EPSILONS,
-    INTERVALS,
     MECHANISMS,
     NONE,
     Kind,
@@ -47,7 +46,7 @@ from agents.play import Cell
 from agents.seeds import TUNING, require_seeds
 from dptse_env.config import TRAINING_SEEDS, VALIDATION_SEEDS
 from dptse_env.estimators.recurrent import FORMAT, read_weights
-from dptse_env.estimators.recurrent_kernels import FEATURES, LOOP_FEATURES
+from dptse_env.estimators.recurrent_kernels import FEATURES
 from dptse_env.utils.validation import Interval, checked_fields, integer, require
 from dptse_env.versions import versions_with
 
@@ -268,8 +267,6 @@ class FilterPlan:
                 if each.conditions.drivers.headway is not None
             ],
         }
-        if ranges.loops > 0.0:
-            found["loop_interval"] = [float(each) for each in INTERVALS]
         if ranges.sections > 0.0:
             found["n_mainline"] += SEGMENTS
             found["segment_length"] += LENGTHS
@@ -281,7 +278,7 @@ class FilterPlan:
         return {
             "name": name,
             "format": FORMAT,
-            "channels": [*FEATURES, *(LOOP_FEATURES if ranges.loops > 0.0 else ())],
+            "channels": list(FEATURES),
             "ranges": {key: [min(values), max(values)] for key, values in found.items() if values},
             "training": {
                 "plan": self.settings(),

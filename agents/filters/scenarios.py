@@ -17,9 +17,6 @@ from agents.filters.highways import KINDS, draw_highway
 from agents.filters.highways import Kind as HighwayKind
 from agents.filters.sections import SEGMENTS, Section
 from agents.play import Cell
-from dptse_env.traffic import Loops
-from dptse_env.traffic.loops import borders_of
-from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.validation import Interval, checked_fields, require
 
 Kind = Literal["flows", "speeds"]
@@ -42,8 +39,6 @@ EPSILONS, CAPS = (0.5, 20.0), (24, 128)
 """Ranges of epsilon, and of the cap of ``capped``; drawn log-uniformly."""
 CONNECTED = (0.05, 0.9)
 """Range of the share of connected vehicles where not all are; drawn log-uniformly."""
-STATIONS, INTERVALS = (0.3, 2.0), (10, 20, 30, 60, 120, 300)
-"""Range of the distance of loop detectors [km], drawn log-uniformly, and their intervals [s]."""
 MISJUDGED = 0.3
 """Deviation of the logarithm of a section's published demand, in half of them."""
 SHARES = 0.16, 0.36, 0.16, 0.16, 0.16
@@ -123,8 +118,7 @@ class Scenario(Cell):
     def is_taught(self) -> bool:
         """True where initial weights may know such roads and noise, and so may teach."""
         is_known = self.section is None and self.keywords["privacy"]["epsilon"] <= EPSILONS[1]
-        has_loops = "loops" in self.keywords.get("corridor", {})
-        return is_known and not has_loops and "penetration" not in self.keywords
+        return is_known and "penetration" not in self.keywords
 
 
 @dataclass(frozen=True)
@@ -136,8 +130,6 @@ class ScenarioRanges:
         sections: Share of the scenarios that are on sections of highways, not in one of `envs`.
         highways: Numbers (first, stop) of these highways; see `numbers_of`.
         free: Share of the sections that are on highways of other kinds than ``queues``.
-        loops: Share of the scenarios with loop detectors; without any, networks do not hear of them
-            and are rewound for their readings.
         connected: Share of those where not all vehicles are connected.
         schedules: Query schedules.
         spans: Spans of queries under ``paced``.
@@ -150,7 +142,6 @@ class ScenarioRanges:
     sections: Annotated[float, Interval(0, 1)] = 0.6
     highways: tuple[int, int] = (0, 80)
     free: Annotated[float, Interval(0, 1)] = 0.6
-    loops: Annotated[float, Interval(0, 1)] = 0.3
     connected: Annotated[float, Interval(0, 1)] = 0.3
     schedules: tuple[str, ...] = SCHEDULES
     spans: tuple[tuple[int, ...], ...] = ((1,), (2,), (1, 2))
@@ -191,9 +182,6 @@ class ScenarioRanges:
         else:
             env, keywords = parse_env(str(rng.choice(self.envs)))
             corridor = make_config(env, keywords).corridor
-            if rng.random() < self.loops:
-                loops = _draw_loops(rng, borders_of(corridor.geometry), seconds).fields()
-                keywords["corridor"] = {**keywords.get("corridor", {}), "loops": loops}
             n_mainline = corridor.geometry.n_mainline
             drawn = rng.choice(np.asarray(traffic), size=n_episodes, replace=False)
             seeds = tuple(int(seed) for seed in drawn)
@@ -208,12 +196,9 @@ class ScenarioRanges:
                 chances["nominal"] += chances.pop("private")  # a field has no vehicles to protect
             source = rng.choice(list(chances), p=list(chances.values()))
             privacy["boundary_inputs"] = str(source)
-        has_loops = "loops" in keywords.get("corridor", {}) or (section and section.loops)
         largest = n_mainline
         if mechanism == "paced":
-            # Readings say something of one segment, so that it must be a query.
-            suitable = [each for each in self.spans if 1 in each or not has_loops] or [(1,)]
-            spans = suitable[int(rng.integers(len(suitable)))]
+            spans = self.spans[int(rng.integers(len(self.spans)))]
             if spans != (1,):
                 keywords |= {"query_spans": list(spans), "bandwidth_unit": "sums"}
                 largest = max(2 * n_mainline // 3, 1)
@@ -242,9 +227,6 @@ class ScenarioRanges:
             segments = most
         n_sensors = int(rng.choice([0, 1, 2, 3], p=[0.6, 0.2, 0.1, 0.1]))
         sensors = rng.choice(segments, size=n_sensors, replace=False)
-        has_loops = not averaged and rng.random() < self.loops
-        borders = borders_of(whole, range(segments))
-        loops = _draw_loops(rng, borders, seconds) if has_loops else None
         misjudged = float(np.exp(rng.normal(0.0, MISJUDGED))) if rng.random() < 0.5 else 1.0
         return Section(
             number,
@@ -255,7 +237,6 @@ class ScenarioRanges:
             sensors=tuple(int(each) for each in sensors),
             seed=int(rng.integers(2**31)),
             kind=kind,
-            loops=loops,
             misjudged=round(misjudged, 3),
             calibrated=bool(rng.random() < CALIBRATED),
         )
@@ -265,15 +246,6 @@ def numbers_of(kind: HighwayKind, highways: tuple[int, int]) -> range:
     """Return the numbers of the highways of a kind: of others than ``queues`` the first fifth."""
     first, stop = highways
     return range(first, stop if kind == "queues" else first + -(-(stop - first) // 5))
-
-
-def _draw_loops(rng: np.random.Generator, borders: FloatArray, seconds: int) -> Loops:
-    """Draw loops at borders of segments [km], for episodes of some seconds."""
-    distance = float(np.exp(rng.uniform(*np.log(STATIONS))))
-    places = np.arange(rng.uniform(0.0, min(distance, borders[-1])), borders[-1], distance)
-    interval = int(rng.choice([each for each in INTERVALS if each <= seconds]))
-    nearest = np.unique(np.abs(borders[:, None] - places).argmin(axis=0))
-    return Loops(tuple(borders[nearest].tolist()), interval=interval)
 
 
 def _draw_privacy(rng: np.random.Generator, mechanism: str) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from dptse_env.estimators.tuned import DEFAULT_PARAMETERS
 from dptse_env.importers.folder import ROAD
 from dptse_env.importers.measured import measure
 from dptse_env.model import ARZParameters, load_parameters
-from dptse_env.traffic import Conditions, Corridor, Loops, Record, RecordLibrary, Scales
+from dptse_env.traffic import Conditions, Corridor, Record, RecordLibrary, Scales
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.imported import Kind, save_records
 from dptse_env.traffic.roads import write_corridor
@@ -55,7 +55,6 @@ class Section:
         kind: Kind of the highway.
         traffic: Traffic seeds of the highway; windows then begin together, one of each seed, which
             is its own one, too. Where there are none, all windows are of seed 0.
-        loops: Loop detectors on the section; None for none.
         misjudged: Published demand over the measured one.
         calibrated: Whether estimators are given parameters that were fitted to it (`parameters`).
     """
@@ -69,7 +68,6 @@ class Section:
     seed: int = 0
     kind: HighwayKind = "queues"
     traffic: tuple[int, ...] = ()
-    loops: Loops | None = None
     misjudged: float = 1.0
     calibrated: bool = False
 
@@ -199,7 +197,6 @@ def _section(highway: Highway, first: int, section: Section) -> tuple[Corridor, 
         conditions=Conditions(demand, section.seconds),
         scales=Scales.of(geometry, average_dwell=8.0),
         fixed_sensors=section.sensors,
-        loops=section.loops,
     )
     return road, np.array(columns)
 

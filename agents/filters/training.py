@@ -48,27 +48,25 @@ class State(NamedTuple):
     hidden: Tensor  # (C, H)
     predicted: FloatArray  # of the next second, with deviations, (C, 4)
     age: FloatArray  # seconds since the last measurement of each cell, (C,)
-    course: FloatArray  # `Memory.course`, (C, 5)
 
 
 def _begin(batch: Batch, width: int) -> State:
     """Return the state before the first second."""
     n = len(batch.start)
-    age, course = np.full(n, LONGEST_AGE), np.zeros((n, 5))
-    return State(torch.zeros(n, width), batch.start, age, course)
+    return State(torch.zeros(n, width), batch.start, np.full(n, LONGEST_AGE))
 
 
 def _advance(
     network: RecurrentNetwork, batch: Batch, window: range, state: State
 ) -> tuple[State, Tensor, Tensor]:
     """Return the state after some seconds, and the estimates of them and of the next ones."""
-    (hidden, predicted, age, course), kept = state, []
+    (hidden, predicted, age), kept = state, []
     hidden = hidden.detach()
     for t in window:
-        hidden = network(batch.roads, batch.features(t, predicted, age, course), hidden)
+        hidden = network(batch.roads, batch.features(t, predicted, age), hidden)
         predicted = network.read(batch.roads, hidden.detach())[1].detach().numpy().astype(float)
         kept.append(hidden)
-    return State(hidden, predicted, age, course), *network.read(batch.roads, torch.stack(kept))
+    return State(hidden, predicted, age), *network.read(batch.roads, torch.stack(kept))
 
 
 class FilterTraining(TrainingFolder):
@@ -103,7 +101,7 @@ class FilterTraining(TrainingFolder):
         super().__init__(folder, plan.settings())
         self.plan, self._records, self._executor = plan, records, executor
         torch.manual_seed(plan.seed)
-        self.network = RecurrentNetwork(plan.width, plan.ranges.loops > 0.0)
+        self.network = RecurrentNetwork(plan.width)
         if plan.initial is not None:
             self.network.take(read_weights(plan.initial).weights)
         self._optimiser = torch.optim.Adam(self.network.parameters(), plan.learning_rate)
@@ -112,7 +110,7 @@ class FilterTraining(TrainingFolder):
         self._teacher = None
         if self._taught_by is not None and plan.teacher > 0.0:
             weights = self._taught_by.weights
-            self._teacher = RecurrentNetwork(weights.width, weights.hears_loops)
+            self._teacher = RecurrentNetwork(weights.width)
             self._teacher.take(weights)
         self.done, self._seconds = 0, 0.0
         if self.checkpoint is not None:

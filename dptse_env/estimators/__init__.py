@@ -10,7 +10,6 @@ from dptse_env.estimators.base import (
     KernelEstimator,
     Measurement,
     Played,
-    Reading,
 )
 from dptse_env.estimators.settings import (
     AdaptiveSmoothingSettings,
@@ -44,7 +43,6 @@ __all__ = [
     "Measurement",
     "MixtureSettings",
     "Played",
-    "Reading",
     "RecurrentSettings",
     "SigmaPointSettings",
     "check_estimator",

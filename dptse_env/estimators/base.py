@@ -148,26 +148,6 @@ class Measurement(NamedTuple):
         )
 
 
-class Reading(NamedTuple):
-    """Last readings of loop detectors, of the segments beside them: arrays of one shape.
-
-    Attributes:
-        density: Mean density in the interval [veh/km].
-        speed: Mean speed [km/h].
-        density_std: Deviation of the mean density.
-        speed_std: Deviation of the mean speed.
-        age: Seconds since the interval ended.
-        interval: Its length [s], 0 where there is no reading.
-    """
-
-    density: FloatArray
-    speed: FloatArray
-    density_std: FloatArray
-    speed_std: FloatArray
-    age: FloatArray
-    interval: FloatArray
-
-
 def _full(name: str, values: Any, shape: tuple[int, ...]) -> FloatArray:
     """Return numbers of full shape; the last axis is not broadcast."""
     given = np.asarray(values, dtype=np.float64)
@@ -296,20 +276,6 @@ class Estimator(ABC):
         if self._largest_speed is not None:
             np.minimum(estimate.speed, self._largest_speed, out=estimate.speed)
         return estimate
-
-    @property
-    def hears_loops(self) -> bool:
-        """True where it takes readings of loops by `hear`; else it is rewound for them."""
-        return False
-
-    def hear(self, episodes: IntArray, told: Reading) -> None:
-        """Take what the last readings of loops say, for the next update.
-
-        Args:
-            episodes: Shape (k,).
-            told: Of these episodes, arrays (k, S).
-        """
-        raise NotImplementedError
 
     @classmethod
     def goes_back(cls) -> bool:

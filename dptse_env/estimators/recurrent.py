@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from dptse_env.estimators.base import Played, Reading, SegmentEstimator
+from dptse_env.estimators.base import Played, SegmentEstimator
 from dptse_env.estimators.recurrent_kernels import (
     FEATURES,
     LONGEST_AGE,
-    LOOP_FEATURES,
     Memory,
     State,
     Weights,
@@ -32,7 +31,7 @@ from dptse_env.estimators.recurrent_kernels import (
 from dptse_env.estimators.settings import EstimatorSettings
 from dptse_env.model import ARZModel
 from dptse_env.road import Road
-from dptse_env.utils.arrays import AnyArray, IntArray
+from dptse_env.utils.arrays import AnyArray
 from dptse_env.utils.files import read_tensors, require_arrays, write_tensors
 from dptse_env.utils.kernels import Bundle
 
@@ -69,13 +68,10 @@ class Recurrent(SegmentEstimator):
         flows = model.releases_flow
         self.saved = weights_for(settings.recurrent.weights, model.road, flows)
         S, n = model.n_segments, n_episodes
-        heard = S if self.hears_loops else 0
         memory = Memory(
             inputs=np.zeros((n, model.n_inputs)),
             present=self.present,
             age=np.full((n, S), LONGEST_AGE),
-            told=np.zeros((n, heard, len(Reading._fields))),
-            course=np.zeros((n, heard, 5)),
             innovations=self.innovations,
         )
         state = State(
@@ -86,7 +82,7 @@ class Recurrent(SegmentEstimator):
         )
         self.hidden = state.hidden
         self.arrays = Bundle(
-            model.road, model.channels, make_cells(model, self.hears_loops), memory,
+            model.road, model.channels, make_cells(model), memory,
             self.saved.weights, state,
         )  # fmt: skip
 
@@ -94,18 +90,8 @@ class Recurrent(SegmentEstimator):
     def _memory(self) -> tuple[AnyArray, ...]:
         _, _, _, memory, _, state = self.arrays.parts
         return (
-            memory.inputs, memory.present, memory.age, memory.told, memory.course, state.hidden,
-            state.ahead, state.priors,
+            memory.inputs, memory.present, memory.age, state.hidden, state.ahead, state.priors,
         )  # fmt: skip
-
-    @property
-    def hears_loops(self) -> bool:
-        """True where its weights have readings of loops among their features."""
-        return self.saved.weights.hears_loops
-
-    def hear(self, episodes: IntArray, told: Reading) -> None:
-        """Take what the last readings say, for the next update."""
-        self.arrays.parts[3].told[episodes] = np.stack(told, axis=-1)
 
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
@@ -243,8 +229,7 @@ def write_weights(path: str | os.PathLike[str], weights: Weights, card: Mapping[
 def _checked(arrays: Mapping[str, AnyArray], card: Mapping[str, Any]) -> Weights:
     """Return the weights of a file's arrays and card, or refuse them."""
     channels = card.get("channels")
-    hears_loops = channels == [*FEATURES, *LOOP_FEATURES]
-    if card.get("format") != FORMAT or not (hears_loops or channels == list(FEATURES)):
+    if card.get("format") != FORMAT or channels != list(FEATURES):
         raise ValueError(
             f"it has features of format {card.get('format')!r}, this version reads {FORMAT!r}"
         )
@@ -258,5 +243,5 @@ def _checked(arrays: Mapping[str, AnyArray], card: Mapping[str, Any]) -> Weights
     width = len(arrays["hidden"]) if "hidden" in arrays and arrays["hidden"].ndim else 0
     if not 1 <= width <= LARGEST_WIDTH:
         raise ValueError(f"its width must be in 1..{LARGEST_WIDTH}, got {width}")
-    require_arrays(arrays, shapes(width, hears_loops), np.float32)
+    require_arrays(arrays, shapes(width), np.float32)
     return Weights(**arrays)

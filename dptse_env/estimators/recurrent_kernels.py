@@ -50,14 +50,6 @@ FEATURES = (
 )  # fmt: skip
 """The features of a cell."""
 N_FEATURES = len(FEATURES)
-LOOP_FEATURES = (
-    "told", "told_density", "told_speed", "log_told_age", "log_interval", "mean_density_correction",
-    "mean_speed_correction", "mean_density_gain", "mean_speed_gain",
-)  # fmt: skip
-"""Further features of a cell beside a station of loop detectors, in networks that hear of them:
-that there is a reading, what it says of the cell, how old and how long its interval is, and, in the
-second in which it comes, corrections and gains of the mean of the predictions in that interval."""
-N_LOOP_FEATURES = len(LOOP_FEATURES)
 
 LONGEST_AGE = 300.0
 """Seconds since a measurement after which a cell counts as never measured."""
@@ -96,10 +88,9 @@ class Cells(NamedTuple):
     flows: bool  # whether flows are released, otherwise speeds
     fixed: FloatArray  # (S, N_FIXED) features
     arz: ARZ  # numbers of the traffic model, whose equilibrium speed is a feature
-    hears_loops: bool  # whether `LOOP_FEATURES` follow
 
 
-def make_cells(model: ARZModel, hears_loops: bool = False) -> Cells:
+def make_cells(model: ARZModel) -> Cells:
     """Return the fixed features of a model's road."""
     road, S = model.road, model.n_segments
     n_on = road.entries.size - 1
@@ -116,7 +107,6 @@ def make_cells(model: ARZModel, hears_loops: bool = False) -> Cells:
         flows=model.releases_flow,
         fixed=np.concatenate([marks, lanes[:, None] / 3.0, scales], axis=1),
         arz=model.arz,
-        hears_loops=hears_loops,
     )
 
 
@@ -135,20 +125,15 @@ class Weights(NamedTuple):
         """Width H of the hidden state."""
         return len(self.hidden)
 
-    @property
-    def hears_loops(self) -> bool:
-        """True where `LOOP_FEATURES` are among the C features."""
-        return len(self.inputs) > N_FEATURES + 2 * message_width(self.width)
-
 
 def message_width(width: int) -> int:
     """Return the size M of a message in a network of some width."""
     return min(width, MESSAGE)
 
 
-def shapes(width: int, hears_loops: bool = False) -> dict[str, tuple[int, ...]]:
+def shapes(width: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of `Weights` of some width by name."""
-    n_inputs = N_FEATURES + N_LOOP_FEATURES * hears_loops + 2 * message_width(width)
+    n_inputs = N_FEATURES + 2 * message_width(width)
     return {
         "inputs": (n_inputs, 3 * width),
         "inputs_bias": (3 * width,),
@@ -165,8 +150,6 @@ class Memory(NamedTuple):
     inputs: FloatArray  # (n, n_u) the model's inputs of the last prediction
     present: FloatArray  # (n, S, 4) predictions, then estimates, and their deviations
     age: FloatArray  # (n, S) seconds since the last measurement
-    told: FloatArray  # (n, S, 6) the last `Reading` of cells; without cells if none is heard
-    course: FloatArray  # (n, S, 5) sums of predictions and their variances since, and their number
     innovations: FloatArray  # (n, M, 2)
 
 
@@ -193,7 +176,6 @@ def _restart(memory: Memory, state: State, e: int) -> None:
     memory.present[e] = state.priors[e]
     state.ahead[e] = state.priors[e]
     memory.age[e] = LONGEST_AGE
-    memory.told[e], memory.course[e] = 0.0, 0.0
     memory.innovations[e] = 0.0
 
 
@@ -229,14 +211,14 @@ def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Ar
     """Write the features of all cells, and innovations; update the ages of measurements.
 
     Args:
-        bundle: Road, channels, `Cells` and `Memory`, whose age, course and innovations are
-            updated; more parts may follow.
+        bundle: Road, channels, `Cells` and `Memory`, whose age and innovations are updated; more
+            parts may follow.
         episodes: Shape (k,).
         measured: The release of the k episodes.
         x: Output, shape (k, S, C or more).
     """
     road, channels, cells, memory = bundle.parts[:4]
-    inputs, present, age, told, course, innovations = memory
+    inputs, present, age, innovations = memory
     S = road.n_segments
     sums, second = np.empty((S, 10)), np.empty((S, 4))
     outside = np.empty((S, 2))
@@ -269,11 +251,6 @@ def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Ar
             for j in range(N_FIXED):
                 row[20 + j] = cells.fixed[s, j]
             row[27] = _equilibrium_speed(cells.arz, s, prior[s, 0]) / cells.limit
-            if cells.hears_loops:
-                _write_told(
-                    told[episode, s], prior[s], course[episode, s], cells.unit[s], cells.limit,
-                    row[N_FEATURES:],
-                )  # fmt: skip
             age[episode, s] = 0.0 if sums[s, 0] > 0.0 else age[episode, s] + 1.0
 
 
@@ -356,38 +333,6 @@ def _write(
     row[14] = min(by_speed**2 * speed_variance * sums[9], 1.0)
     row[15], row[16] = slip / limit, flows
     row[17] = 0.25 * np.log(1.0 + min(age, LONGEST_AGE))
-
-
-@inline_part
-def _write_told(
-    told: FloatArray,
-    prior: FloatArray,
-    course: FloatArray,
-    unit: float,
-    limit: float,
-    row: Float32Array,
-) -> None:
-    """Write `LOOP_FEATURES` of a cell, 0 where no reading says anything of it; update its course.
-
-    A reading is of a mean, so it corrects the mean of what was predicted in its interval.
-    """
-    row[:N_LOOP_FEATURES] = 0.0
-    age, interval = told[4], told[5]
-    for j in range(2):
-        course[j] += prior[j]
-        course[2 + j] += prior[2 + j] ** 2
-    course[4] += 1.0
-    if interval > 0.0:
-        row[0], row[1], row[2] = 1.0, told[0] / unit, told[1] / limit
-        row[3], row[4] = 0.25 * np.log(1.0 + age), 0.25 * np.log(interval)
-        if age == 0.0:
-            for j in range(2):
-                mean, variance = course[j] / course[4], course[2 + j] / course[4]
-                gain = variance / (variance + told[2 + j] ** 2)
-                scale = unit if j == 0 else limit
-                row[5 + j] = 4.0 * _correction(gain * (told[j] - mean) / scale)
-                row[7 + j] = gain
-            course[:] = 0.0
 
 
 @kernel_part

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dptse_env.estimators import Measurement, Reading
+from dptse_env.estimators import Measurement
 from dptse_env.release import Task, Traffic
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, kernel
@@ -228,19 +228,6 @@ class LoopReadings:
         """
         found: FloatArray = self._said[traffic, times // self.interval - 1]
         return found
-
-    def heard(self, traffic: IntArray, times: IntArray) -> Reading:
-        """Return the last readings at seconds (k,), as `Estimator.hear` takes them."""
-        found = np.zeros((len(Reading._fields), len(times), self._traffic.corridor.road.n_segments))
-        known = np.flatnonzero(times >= self.interval)
-        said = Said(*np.moveaxis(self.said_until(traffic[known], times[known]), -1, 0))
-        speed_std = np.where(said.speed_std < UNKNOWN, said.speed_shared, UNKNOWN)
-        age = np.broadcast_to((times[known] % self.interval)[:, None], said.density.shape)
-        rows = said.density, said.speed, said.density_shared, speed_std, age
-        told = np.stack([*rows, np.full(said.density.shape, self.interval)])
-        told[:, np.isnan(said.density)] = 0.0
-        found[:, known[:, None], self.segments] = told
-        return Reading(*found)
 
     def told(self, said: FloatArray, estimated: FloatArray) -> FloatArray:
         """Return what the N seconds are told, by what an estimator took them for before.
