@@ -731,7 +731,6 @@ def _played(config: EnvConfig) -> Played:
     ]
     own = [each.drivers or conditions.drivers for each in conditions.vehicle_classes]
     headways = [each.headway for each in own or [conditions.drivers]]
-    loops = config.corridor.loops
     return {
         "flows": (config.releases_flow,),
         "span": (max(config.query_spans),),
@@ -740,5 +739,4 @@ def _played(config: EnvConfig) -> Played:
         "slow_share": (sum(each.share for each in slow),),
         "slow_speed": [each.largest_speed for each in slow if each.largest_speed is not None],
         "headway": [each for each in headways if each is not None],
-        "loop_interval": () if loops is None else (loops.interval,),
     }

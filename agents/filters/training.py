@@ -127,7 +127,7 @@ class FilterTraining(TrainingFolder):
                 first, last = last, last + each.passes
                 if self.done == first:
                     self._save(PLAYED)
-                collected = self._collect(index) if self.done < last else []
+                collected = self.collect(index) if self.done < last else []
                 while self.done < last:
                     row = self._pass(index, collected)
                     bar.update()
@@ -136,7 +136,8 @@ class FilterTraining(TrainingFolder):
         self._save(WEIGHTS)
         self.write_curve()
 
-    def _collect(self, index: int) -> list[Episodes]:
+    def collect(self, index: int) -> list[Episodes]:
+        """Play the scenarios of a round, and return what a batch is drawn from."""
         name = self.plan.rounds[index].estimator
         estimator = played_by(self.folder / PLAYED) if name == OWN else {"estimator": name}
         work = partial(collect, estimator=estimator, records=self._records)

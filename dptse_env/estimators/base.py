@@ -40,8 +40,6 @@ Played = Mapping[str, Sequence[float]]
     [km/h].
 ``headway``
     Desired time headways of drivers [s], where they are given.
-``loop_interval``
-    Interval of loops [s].
 """
 
 

@@ -20,7 +20,7 @@ from dptse_env.estimators import (
 )
 from dptse_env.estimators.base import Estimator
 from dptse_env.estimators.recurrent import FORMAT, write_weights
-from dptse_env.estimators.recurrent_kernels import FEATURES, LOOP_FEATURES, Weights, shapes
+from dptse_env.estimators.recurrent_kernels import FEATURES, Weights, shapes
 from dptse_env.model import ARZModel, Channels, load_parameters
 from dptse_env.traffic import PAPER_HIGHWAY, Corridor, RecordLibrary
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
@@ -254,20 +254,18 @@ RANGES = {
 }
 
 
-def random_weights(width=8, hears_loops=False):
+def random_weights(width=8):
     """Weights of the size that training gives, so that gates work and outputs move."""
     rng, size = np.random.default_rng(0), 0.4 * (8 / width) ** 0.5
-    arrays = {
-        name: rng.normal(0.0, size, shape) for name, shape in shapes(width, hears_loops).items()
-    }
+    arrays = {name: rng.normal(0.0, size, shape) for name, shape in shapes(width).items()}
     return Weights(**{name: array.astype(np.float32) for name, array in arrays.items()})
 
 
-def card(hears_loops=False, **ranges):
+def card(**ranges):
     return {
         "name": "random",
         "format": FORMAT,
-        "channels": [*FEATURES, *(LOOP_FEATURES if hears_loops else ())],
+        "channels": list(FEATURES),
         "ranges": {**RANGES, **ranges},
         "training": {"seed": 0},
     }
@@ -277,5 +275,5 @@ def weights_settings(folder, weights=None, **ranges):
     """Settings of weights that are written into a folder."""
     path = folder / "weights.safetensors"
     weights = weights or random_weights()
-    write_weights(path, weights, card(weights.hears_loops, **ranges))
+    write_weights(path, weights, card(**ranges))
     return EstimatorSettings(recurrent=RecurrentSettings(weights=str(path)))

@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from dptse_env.estimators import Measurement, Reading
+from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent import (
     member_for,
     outside,
@@ -40,7 +40,7 @@ def of_weights(episodes, folder, weights=None, **ranges):
 # Beside the network that is trained ---------------------------------------------------------------
 
 
-def features(model, measured, inputs, prior, age, told=None, course=()):
+def features(model, measured, inputs, prior, age):
     """The features and innovations of one episode, as the module's docstring has them.
 
     All rows and cells are treated at once.
@@ -51,8 +51,6 @@ def features(model, measured, inputs, prior, age, told=None, course=()):
         inputs: The model's inputs, shape (n_u,).
         prior: Predictions and deviations, shape (S, 4).
         age: Seconds since the last measurement of each cell, shape (S,).
-        told: The last readings of loop detectors, arrays (S,); None for no such features.
-        course: The predictions since those before; updated.
     """
     cells, flows = make_cells(model), float(model.centre is not None)
     observed, values, sigma, centre = (part[0] for part in measured)
@@ -94,19 +92,6 @@ def features(model, measured, inputs, prior, age, told=None, course=()):
         *outside, *cells.fixed.T,
         np.maximum(model.parameters.free_flow_speed - model.pressure(rho), 0.0) / limit,
     ]  # fmt: skip
-    if told is not None:
-        course.append(prior)
-        there, comes = told.interval > 0, (told.interval > 0) & (told.age == 0)
-        mean, variance = np.mean(course, axis=0).T[:2], np.mean(np.square(course), axis=0).T[2:]
-        read = np.stack(told[:2])
-        gain = variance / (variance + np.square(told[2:4]))
-        lacking = 4 * held(gain * (read - mean) / np.stack([unit, np.full(len(v), limit)]), 2.0)
-        with np.errstate(divide="ignore"):
-            last = [read[0] / unit, read[1] / limit, *0.25 * np.log((1 + told.age, told.interval))]
-        numbers += [np.where(there, each, 0.0) for each in (1.0, *last)]
-        numbers += [np.where(comes, each, 0.0) for each in (*lacking, *gain)]
-        if comes.any():  # all of an episode at once
-            course.clear()
     age[:] = np.where(n > 0, 0.0, age + 1.0)
     return np.stack(numbers, axis=-1), innovations
 
@@ -118,7 +103,7 @@ class Twin:
         self.model, n = estimator.model, estimator.n_episodes
         cells = make_cells(self.model)
         weights = estimator.saved.weights
-        self.network = trained.RecurrentNetwork(weights.width, weights.hears_loops)
+        self.network = trained.RecurrentNetwork(weights.width)
         self.network.take(estimator.saved.weights)
         S = self.model.n_segments
         edges = self.model.road.edges + S * np.arange(n)[:, None, None]
@@ -136,17 +121,12 @@ class Twin:
         self.ahead = np.stack([said.density, said.speed, said.density_std, said.speed_std], -1)
         self.hidden = torch.zeros(n * S, self.network.width)
         self.age = np.full(self.ahead.shape[:2], LONGEST_AGE)
-        self.courses = [[] for _ in range(n)]
 
-    def step(self, inputs, given, told=None):
+    def step(self, inputs, given):
         """Return the estimates and deviations after a step, and before the next `(n, S, 4)`."""
-        n = len(self.ahead)
-        told = (
-            [None] * n if told is None else [Reading(*(each[k] for each in told)) for k in range(n)]
-        )
         both = [
             features(self.model, [part[k : k + 1] for part in given], inputs[k], *prior)
-            for k, prior in enumerate(zip(self.ahead, self.age, told, self.courses, strict=True))
+            for k, prior in enumerate(zip(self.ahead, self.age, strict=True))
         ]
         x, self.innovations = (np.stack(each) for each in zip(*both, strict=True))
         with torch.no_grad():
@@ -168,35 +148,20 @@ def _double():
 
 @pytest.mark.usefixtures("_double")
 @pytest.mark.parametrize(
-    ("release", "width", "noise", "hears_loops"),
-    [
-        ("speed", 8, 1.0, False),
-        ("flow", 20, 10.0, False),
-        ("rows", 8, 1.0, False),
-        ("flow", 20, 1.0, True),
-    ],
+    ("release", "width", "noise"), [("speed", 8, 1.0), ("flow", 20, 10.0), ("rows", 8, 1.0)]
 )
-def test_it_is_the_network_that_is_trained(release, width, noise, hears_loops, tmp_path):
+def test_it_is_the_network_that_is_trained(release, width, noise, tmp_path):
     """Messages are all of the hidden state, or a part of it, in single precision.
 
     What is far off is held to a range.
     """
     episodes = simulate(n=3, n_steps=40, noise=noise, release=release)
-    estimator = of_weights(episodes, tmp_path, random_weights(width, hears_loops))
-    assert estimator.hears_loops == hears_loops
-    twin, far, told = Twin(estimator), [], None
-    rng, shape = np.random.default_rng(1), (3, episodes.model.n_segments)
-    beside = rng.random(shape) < 0.5
+    estimator = of_weights(episodes, tmp_path, random_weights(width))
+    twin, far = Twin(estimator), []
     for k in range(40):
-        if hears_loops:
-            said = rng.uniform(1.0, 200.0, (4, *shape))
-            said[3, 0, 0] = 1e5
-            interval = np.where(beside & (k >= 10), 10.0, 0.0)
-            told = Reading(*said, np.full(shape, k % 10.0), interval)
-            estimator.hear(episodes.everyone, told)
         step(estimator, episodes, k)
         given = Measurement.of(episodes.model, **episodes.released(k, episodes.everyone))
-        present, ahead = twin.step(episodes.inputs[k], given, told)
+        present, ahead = twin.step(episodes.inputs[k], given)
         hidden = twin.hidden.reshape(estimator.hidden.shape)
         np.testing.assert_allclose(estimator.hidden, hidden, atol=1e-5)
         np.testing.assert_allclose(estimator.means, present[..., :2], rtol=1e-5, atol=1e-3)
@@ -261,7 +226,7 @@ def test_what_weights_were_not_trained_on_is_named(tmp_path):
         ({"span": [1, 2], "flows": [1, 1]}, ["span", "flows"]),
         ({"lanes": [2, 3], "speed_limit": [80.0, 100.0]}, ["speed_limit", "lanes"]),
         ({"epsilon": [0.5, 20.0], "slow_share": [0.0, 0.2]}, ["epsilon", "slow_share"]),
-        ({"slow_speed": [25.0, 95.0], "headway": [1.0, 2.0], "loop_interval": [10, 300]}, []),
+        ({"slow_speed": [25.0, 95.0], "headway": [1.0, 2.0]}, []),
     ):
         write_weights(path, random_weights(), {**card(), "ranges": ranges})
         assert set(outside(read_weights(str(path)), road.road, PLAYED)) == set(names)

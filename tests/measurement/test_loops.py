@@ -11,7 +11,6 @@ from dptse_env.measurement.loops import interpreted, seconds_told
 from dptse_env.process import QueryProcess
 from dptse_env.traffic import CORRIDORS, Loops, RecordLibrary, Stations, readings
 from dptse_env.traffic.loops import borders_of
-from tests.estimators.helpers import random_weights, weights_settings
 
 SEEDS = range(2000, 2004)
 
@@ -216,25 +215,3 @@ def test_stations_at_all_borders_make_no_estimate_worse(estimator, n_queries, pr
         loops = {"positions": borders, "interval": interval}
         growth = errors(seeds, preset, n_queries, **given, loops=loops).mean() / without - 1.0
         assert growth < (0.04 if (estimator, preset) == ("enkf", "short-highway") else 0.02)
-
-
-# A network that hears of them ---------------------------------------------------------------------
-
-
-def test_a_network_hears_what_the_last_interval_said(tmp_path):
-    settings = weights_settings(tmp_path, random_weights(hears_loops=True))
-    loops, both = {"positions": [0.0, 0.3], "interval": 20}, np.arange(2)
-    keywords = {"estimator": "recurrent", "estimator_settings": settings, "loops": loops}
-    process = QueryProcess(resolve("short-highway", {**keywords, "traffic_seeds": "0:2"}), 2)
-    process.reset(both, [np.random.default_rng(seed) for seed in range(2)])
-    assert process.rewind is None
-    told, nothing = process.estimator.arrays.parts[3].told, np.zeros((2, 6), dtype=np.int8)
-    for second in range(1, 46):
-        process.step(both, nothing)
-        assert told.any() == (second >= 20)
-    read = process.traffic.readings[process.traffic_index, 1]
-    beside, said = np.unique(process.config.corridor.stations.beside), process.loops.said(read)
-    np.testing.assert_allclose(told[:, beside, :2], np.stack(said[:2], axis=-1))
-    np.testing.assert_allclose(told[:, beside, 2], said.density_shared)
-    np.testing.assert_array_equal(told[:, beside, 4:], np.full((2, len(beside), 2), (5.0, 20.0)))
-    assert not told[:, np.setdiff1d(np.arange(told.shape[1]), beside)].any()
