@@ -89,7 +89,7 @@ KNOWN = {
     "n_mainline": [6, 20], "segment_length": [0.1, 0.15], "speed_limit": [80.0, 110.0],
     "lanes": [1, 6], "span": [1, 2], "flows": [1, 1], "epsilon": [0.5, 20.0],
     "connected": [0.05, 1.0], "slow_share": [0.0, 0.2], "slow_speed": [80.0, 95.0],
-    "headway": [0.8, 2.0], "loop_interval": [10, 300],
+    "headway": [0.8, 2.0],
 }  # fmt: skip
 """Ranges on a card: all properties that one may name."""
 WITHIN = {**classes(0.2), "epsilon": 20.0, "penetration": [0.05, 0.2], "query_spans": [1, 2]}
@@ -108,7 +108,6 @@ BEYOND = [
     ("slow_speed", classes(speed=70.0), "70"),
     ("headway", {"corridor": {"drivers": {"headway": 0.5}}}, "0.5"),
     ("headway", classes(speed=None, drivers={"headway": 2.5}), "2.5"),
-    ("loop_interval", {"loops": {"positions": [0.3], "interval": 600}}, "600"),
 ]
 
 
