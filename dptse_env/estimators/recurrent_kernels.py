@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators.base import Measurement
-from dptse_env.model import ARZ, ARZModel
+from dptse_env.model import ARZ, ARZModel, available_parameters
 from dptse_env.model.step import clip
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, all_finite, inline_part, kernel, kernel_part
@@ -47,6 +47,7 @@ FEATURES = (
     "second_innovation", "density_correction", "density_correction_by_flow", "speed_correction",
     "density_gain", "speed_gain", "slip", "flows", "log_age", "inflow", "outside_density",
     "on_ramp", "off_ramp", "entry", "exit", "lanes", "log_length", "log_limit", "equilibrium_speed",
+    "own_parameters", "own_equilibrium_speed",
 )  # fmt: skip
 """The features of a cell."""
 N_FEATURES = len(FEATURES)
@@ -88,6 +89,7 @@ class Cells(NamedTuple):
     flows: bool  # whether flows are released, otherwise speeds
     fixed: FloatArray  # (S, N_FIXED) features
     arz: ARZ  # numbers of the traffic model, whose equilibrium speed is a feature
+    own: float  # 1 where its parameters are the road's own, 0 where they are a shipped set
 
 
 def make_cells(model: ARZModel) -> Cells:
@@ -107,6 +109,7 @@ def make_cells(model: ARZModel) -> Cells:
         flows=model.releases_flow,
         fixed=np.concatenate([marks, lanes[:, None] / 3.0, scales], axis=1),
         arz=model.arz,
+        own=float(model.parameters.name not in available_parameters()),
     )
 
 
@@ -251,6 +254,7 @@ def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Ar
             for j in range(N_FIXED):
                 row[20 + j] = cells.fixed[s, j]
             row[27] = _equilibrium_speed(cells.arz, s, prior[s, 0]) / cells.limit
+            row[28], row[29] = cells.own, cells.own * row[27]
             age[episode, s] = 0.0 if sums[s, 0] > 0.0 else age[episode, s] + 1.0
 
 

@@ -90,7 +90,8 @@ def features(model, measured, inputs, prior, age):
         np.minimum(by_speed**2 * P_v * (1 / V_y @ H**2), 1.0),
         slip / limit, np.full(len(v), flows), 0.25 * np.log(1.0 + np.minimum(age, LONGEST_AGE)),
         *outside, *cells.fixed.T,
-        np.maximum(model.parameters.free_flow_speed - model.pressure(rho), 0.0) / limit,
+        settled := np.maximum(model.parameters.free_flow_speed - model.pressure(rho), 0.0) / limit,
+        np.full(len(v), own := float(model.parameters.name == "own")), own * settled,
     ]  # fmt: skip
     age[:] = np.where(n > 0, 0.0, age + 1.0)
     return np.stack(numbers, axis=-1), innovations
