@@ -96,9 +96,6 @@ def collect(scenario: Scenario, estimator: Mapping[str, Any], records: Records) 
         if scenario.section is not None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dptse-section-")))
             keywords["corridor"] = str(scenario.section.write(folder, library))
-            if scenario.section.calibrated:
-                fitted = dataclasses.asdict(scenario.section.parameters(library))
-                keywords["parameters"] = fitted
         env = make_vector(scenario.env, len(seeds), keywords)
         record(env.config.corridor, seeds, library)
         return _play(env, scenario)

@@ -39,7 +39,6 @@ from agents.filters.scenarios import (
     Kind,
     Scenario,
     ScenarioRanges,
-    numbers_of,
 )
 from agents.filters.sections import SEGMENTS, Section
 from agents.play import Cell
@@ -112,8 +111,8 @@ class FilterPlan:
         validation_seeds: Traffic seeds to validate on.
         rounds: Rounds, one after the other.
         validation_envs: Environments to validate in, as ``ID`` or ``ID {JSON}``.
-        validation_highways: Numbers (first, stop) of the highways to validate on, of all kinds
-            (`numbers_of`), with a section of each.
+        validation_highways: Numbers (first, stop) of the highways to validate on, of every kind,
+            with a section of each.
         ranges: Ranges that scenarios are drawn from.
         width: Width of the hidden state.
         windows: Windows of a section, or traffic seeds of another scenario.
@@ -137,7 +136,7 @@ class FilterPlan:
     validation_seeds: tuple[int, ...]
     rounds: tuple[Round, ...]
     validation_envs: tuple[str, ...] = ()
-    validation_highways: tuple[int, int] = (1000, 1012)
+    validation_highways: tuple[int, int] = (1000, 1006)
     ranges: ScenarioRanges = field(default_factory=ScenarioRanges)
     width: Annotated[int, Interval(1, 512)] = 64
     windows: Annotated[int, Interval(1, 24)] = 16
@@ -212,17 +211,20 @@ class FilterPlan:
         """Return the sections to validate on."""
         found = []
         for kind in KINDS if self.ranges.free > 0.0 else KINDS[:1]:
-            for k, number in enumerate(numbers_of(kind, self.validation_highways)):
+            for k, number in enumerate(range(*self.validation_highways)):
                 most = draw_highway(number, kind).corridor.geometry.n_mainline - 2
                 segments = min(8 + 2 * (k % 6), most)
-                found.append(Section(number, segments, 4, self.seconds, kind=kind))
+                calibrated = k % 2 == 1
+                found.append(
+                    Section(number, segments, 4, self.seconds, kind=kind, calibrated=calibrated)
+                )
         return found
 
     def highways(self) -> list[tuple[HighwayKind, int]]:
         """Return the highways to train and to validate on, by kind and number."""
         kinds = KINDS if self.ranges.free > 0.0 else KINDS[:1]
         ranges = (self.ranges.highways, self.validation_highways)
-        return [(k, number) for k in kinds for each in ranges for number in numbers_of(k, each)]
+        return [(k, number) for k in kinds for each in ranges for number in range(*each)]
 
     def validation_cells(
         self, roads: Sequence[Path] = (), estimator: Mapping[str, Any] = MappingProxyType({})

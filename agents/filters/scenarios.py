@@ -128,7 +128,7 @@ class ScenarioRanges:
     Attributes:
         envs: Environments, each an id or an id, a space and keywords as JSON (`parse_env`).
         sections: Share of the scenarios that are on sections of highways, not in one of `envs`.
-        highways: Numbers (first, stop) of these highways; see `numbers_of`.
+        highways: Numbers (first, stop) of these highways, of every kind.
         free: Share of the sections that are on highways of other kinds than ``queues``.
         connected: Share of those where not all vehicles are connected.
         schedules: Query schedules.
@@ -140,7 +140,7 @@ class ScenarioRanges:
 
     envs: tuple[str, ...] = ROADS
     sections: Annotated[float, Interval(0, 1)] = 0.6
-    highways: tuple[int, int] = (0, 80)
+    highways: tuple[int, int] = (0, 64)
     free: Annotated[float, Interval(0, 1)] = 0.6
     connected: Annotated[float, Interval(0, 1)] = 0.3
     schedules: tuple[str, ...] = SCHEDULES
@@ -218,7 +218,7 @@ class ScenarioRanges:
         kind: HighwayKind = "queues"
         if rng.random() < self.free:
             kind = KINDS[1:][int(rng.choice(len(SHARES), p=SHARES))]
-        number = int(rng.choice(numbers_of(kind, self.highways)))
+        number = int(rng.integers(*self.highways))
         whole = draw_highway(number, kind).corridor.geometry
         most = min(whole.n_mainline - 2, SEGMENTS[1])
         fewest = SEGMENTS[0]
@@ -240,12 +240,6 @@ class ScenarioRanges:
             misjudged=round(misjudged, 3),
             calibrated=bool(rng.random() < CALIBRATED),
         )
-
-
-def numbers_of(kind: HighwayKind, highways: tuple[int, int]) -> range:
-    """Return the numbers of the highways of a kind: of others than ``queues`` the first fifth."""
-    first, stop = highways
-    return range(first, stop if kind == "queues" else first + -(-(stop - first) // 5))
 
 
 def _draw_privacy(rng: np.random.Generator, mechanism: str) -> dict[str, Any]:

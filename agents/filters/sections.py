@@ -56,7 +56,7 @@ class Section:
         traffic: Traffic seeds of the highway; windows then begin together, one of each seed, which
             is its own one, too. Where there are none, all windows are of seed 0.
         misjudged: Published demand over the measured one.
-        calibrated: Whether estimators are given parameters that were fitted to it (`parameters`).
+        calibrated: Whether its road file has parameters that were fitted to it (`parameters`).
     """
 
     highway: int
@@ -105,7 +105,10 @@ class Section:
             {"seed": seed, "start": start} for seed, start in zip(seeds, starts, strict=True)
         ]
         kept = save_records(folder, road, cuts, sources, kind)
-        write_corridor(folder / ROAD, road.replaced(recordings=kept))
+        environment = {}
+        if self.calibrated:
+            environment["parameters"] = dataclasses.asdict(self.parameters(library))
+        write_corridor(folder / ROAD, road.replaced(recordings=kept), environment)
         return folder / ROAD
 
     def parameters(self, library: RecordLibrary) -> ARZParameters:
