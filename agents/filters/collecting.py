@@ -243,7 +243,8 @@ def _roads(parts: Sequence[Episodes]) -> Roads:
         offsets = first + S * np.arange(k)[:, None, None]
         columns.append((
             np.tile(cells.unit[:S], k),
-            np.full(k * S, cells.limit),
+            np.full(k * S, cells.speed_unit),
+            np.full(k * S, cells.fastest),
             (corridor.road.edges + offsets).reshape(-1, 2),
             np.tile(units, (k * S, 1)),
             np.tile(np.arange(S) < corridor.geometry.n_mainline, k),
@@ -252,10 +253,12 @@ def _roads(parts: Sequence[Episodes]) -> Roads:
         ))  # fmt: skip
         first, n_episodes = first + k * S, n_episodes + k
     arrays = [np.concatenate(column) for column in zip(*columns, strict=True)]
-    unit, limit, edges, scales, mainline, episode, taught = map(torch.from_numpy, arrays)
+    tensors = map(torch.from_numpy, arrays)
+    unit, speed_unit, fastest, edges, scales, mainline, episode, taught = tensors
     return Roads(
         unit=unit.float(),
-        limit=limit.float(),
+        speed_unit=speed_unit.float(),
+        fastest=fastest.float(),
         edges=edges.long(),
         scales=scales.float(),
         mainline=mainline.float(),

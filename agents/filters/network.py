@@ -12,7 +12,6 @@ from dptse_env.estimators.recurrent_kernels import (
     DENSITY_RANGE,
     HIGHEST_SPREAD,
     LOWEST_SPREAD,
-    SPEED_RANGE,
     Weights,
     message_width,
     shapes,
@@ -23,7 +22,8 @@ class Roads(NamedTuple):
     """The cells of k episodes in a row, on any roads, with the units of their errors."""
 
     unit: Tensor  # (C,) of densities [veh/km]
-    limit: Tensor  # (C,) unit of speeds [km/h]
+    speed_unit: Tensor  # (C,) of speeds [km/h]
+    fastest: Tensor  # (C,) largest speeds that are estimated [km/h]
     edges: Tensor  # (E, 2) cells (from, to) between which vehicles pass
     scales: Tensor  # (C, 2) of errors of densities [veh/km] and speeds [km/h]
     mainline: Tensor  # (C,) flags
@@ -115,8 +115,8 @@ def _outputs(roads: Roads, raw: Tensor) -> Tensor:
     mean = torch.sigmoid(raw[..., :2])
     spread = torch.exp(torch.clip(raw[..., 2:], LOWEST_SPREAD, HIGHEST_SPREAD))
     parts = [
-        DENSITY_RANGE * roads.unit * mean[..., 0], SPEED_RANGE * roads.limit * mean[..., 1],
-        roads.unit * spread[..., 0], roads.limit * spread[..., 1],
+        DENSITY_RANGE * roads.unit * mean[..., 0], roads.fastest * mean[..., 1],
+        roads.unit * spread[..., 0], roads.speed_unit * spread[..., 1],
     ]  # fmt: skip
     return torch.stack(parts, -1)
 

@@ -260,6 +260,7 @@ class FilterPlan:
             "lanes": [float(count) for road in roads for count in road.geometry.segment_lanes],
             "span": [1.0, *(float(span) for spans in ranges.spans for span in spans)],
             "flows": [float(self.kind == "flows")],
+            "own_parameters": [0.0, float(ranges.sections > 0.0)],
             "epsilon": [EPSILONS[0], NONE],
             "connected": [CONNECTED[0], 1.0] if ranges.connected > 0.0 else [1.0],
             "slow_share": [0.0],

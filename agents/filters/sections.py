@@ -112,7 +112,9 @@ class Section:
         return folder / ROAD
 
     def parameters(self, library: RecordLibrary) -> ARZParameters:
-        """Return parameters whose equilibrium speeds are those of its highway, within 3 %.
+        """Return parameters whose equilibrium speeds are about those of its highway.
+
+        The free-flow speed is 3 % off, and 12 % on one of five sections.
 
         What a search of parameters finds lies near them, and takes a thousand times as long.
         """
@@ -131,9 +133,10 @@ class Section:
         first, low, high = (start.free_flow_speed, 1.0, 1.0), (20.0, 0.3, 0.6), (200.0, 4.0, 1.6)
         found = least_squares(lacking, first, bounds=(low, high), loss="soft_l1", f_scale=10.0).x
         rng = np.random.default_rng([80, self.highway, self.seed])
+        deviation = 0.03 if rng.random() < 0.8 else 0.12
         fitted = dataclasses.replace(
             start,
-            free_flow_speed=float(found[0] * np.exp(rng.normal(0.0, 0.03))),
+            free_flow_speed=float(found[0] * np.exp(rng.normal(0.0, deviation))),
             gamma=float(found[1]),
             jam_density=float(found[2] * start.jam_density),
         )

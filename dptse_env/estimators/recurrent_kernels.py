@@ -60,14 +60,15 @@ LEAST_VARIANCE = 1e-12
 LARGEST_INNOVATION = 6.0
 """Largest innovation among the features, in deviations."""
 LARGEST_CORRECTION = 2.0
-"""Largest correction among the features, in units of density or speed limits."""
+"""Largest correction among the features, in units of density or speed."""
 
 DENSITY_UNIT = 40.0
 """Unit of densities [veh/km] for each lane, between free flow and a jam."""
 DENSITY_RANGE = 4.0
 """Largest density that is estimated, in its unit: vehicles that stand, 6.25 m each."""
-SPEED_RANGE = 1.1
-"""Largest speed that is estimated, in speed limits."""
+SPEED_RANGE, OWN_SPEED_RANGE = 1.1, 1.4
+"""Largest speed that is estimated, in limits, or in free-flow speeds of a road's own parameters, which
+are means of all vehicles."""
 
 N_FIXED = 7
 """Number of the features of a cell that never change."""
@@ -76,7 +77,7 @@ N_HEADS = 8
 MESSAGE = 16
 """Numbers of a hidden state that the cells next to it read, or all where there are fewer."""
 LOWEST_SPREAD, HIGHEST_SPREAD = -7.0, 0.5
-"""Range of the logarithms of reported deviations, in units of density and of the speed limit."""
+"""Range of the logarithms of reported deviations, in units of density and of speed."""
 
 _ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
@@ -85,7 +86,8 @@ class Cells(NamedTuple):
     """Features of the cells of a road that never change, and their units."""
 
     unit: FloatArray  # (S + R,) unit of densities [veh/km]
-    limit: float  # largest speed limit [km/h], the unit of speeds
+    speed_unit: float  # unit of speeds [km/h]
+    fastest: float  # largest speed that is estimated [km/h]
     flows: bool  # whether flows are released, otherwise speeds
     fixed: FloatArray  # (S, N_FIXED) features
     arz: ARZ  # numbers of the traffic model, whose equilibrium speed is a feature
@@ -93,7 +95,12 @@ class Cells(NamedTuple):
 
 
 def make_cells(model: ARZModel) -> Cells:
-    """Return the fixed features of a model's road."""
+    """Return the fixed features of a model's road.
+
+    The unit of speeds is the free-flow speed of the road's own parameters. Where there are none it
+    is the largest speed limit. So a limit that nobody drives at makes no difference to a road that
+    has been calibrated.
+    """
     road, S = model.road, model.n_segments
     n_on = road.entries.size - 1
     marks = np.zeros((S, 4))
@@ -102,14 +109,18 @@ def make_cells(model: ARZModel) -> Cells:
     marks[road.entries, 2] = 1.0
     marks[road.exits, 3] = 1.0
     lengths, lanes, limits = road.lengths[:S], road.lanes[:S], road.limits[:S]
-    scales = np.stack([np.log(lengths / 0.1), np.log(limits / 100.0)], axis=1)
+    own = model.parameters.name not in available_parameters()
+    speed_unit = float(model.arz.free_flow_speed if own else limits.max())
+    speeds = speed_unit * limits / limits.max()
+    scales = np.stack([np.log(lengths / 0.1), np.log(speeds / 100.0)], axis=1)
     return Cells(
         unit=DENSITY_UNIT * road.lanes,
-        limit=float(limits.max()),
+        speed_unit=speed_unit,
+        fastest=speed_unit * (OWN_SPEED_RANGE if own else SPEED_RANGE),
         flows=model.releases_flow,
         fixed=np.concatenate([marks, lanes[:, None] / 3.0, scales], axis=1),
         arz=model.arz,
-        own=float(model.parameters.name not in available_parameters()),
+        own=float(own),
     )
 
 
@@ -253,7 +264,7 @@ def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Ar
             row[18], row[19] = outside[s, 0], outside[s, 1]
             for j in range(N_FIXED):
                 row[20 + j] = cells.fixed[s, j]
-            row[27] = _equilibrium_speed(cells.arz, s, prior[s, 0]) / cells.limit
+            row[27] = _equilibrium_speed(cells.arz, s, prior[s, 0]) / cells.speed_unit
             row[28], row[29] = cells.own, cells.own * row[27]
             age[episode, s] = 0.0 if sums[s, 0] > 0.0 else age[episode, s] + 1.0
 
@@ -317,7 +328,7 @@ def _write(
     row: Float32Array,
 ) -> None:
     """Write the features of a cell, from the sums over the channels that cover it."""
-    unit, limit, flows = cells.unit[s], cells.limit, 1.0 if cells.flows else 0.0
+    unit, speed_unit, flows = cells.unit[s], cells.speed_unit, 1.0 if cells.flows else 0.0
     by_speed, slip = second[2], second[3]
     density_variance, speed_variance = prior[2] ** 2, prior[3] ** 2
     count = sums[0]
@@ -325,17 +336,17 @@ def _write(
     log_unit = np.log(unit)
     row[0], row[1] = queried, sums[1]
     row[2] = 0.2 * (sums[2] * each - queried * log_unit)
-    row[3] = 0.2 * (sums[3] * each - queried * (flows * log_unit + np.log(limit)))
-    row[4], row[5] = prior[0] / unit, prior[1] / limit
-    row[6], row[7] = 0.25 * np.log(prior[2] / unit), 0.25 * np.log(prior[3] / limit)
+    row[3] = 0.2 * (sums[3] * each - queried * (flows * log_unit + np.log(speed_unit)))
+    row[4], row[5] = prior[0] / unit, prior[1] / speed_unit
+    row[6], row[7] = 0.25 * np.log(prior[2] / unit), 0.25 * np.log(prior[3] / speed_unit)
     for j in range(2):
         row[8 + j] = 0.5 * clip(sums[4 + j], -LARGEST_INNOVATION, LARGEST_INNOVATION)
     row[10] = 4.0 * _correction(density_variance * sums[6] / unit)
     row[11] = 4.0 * _correction(slip * density_variance * sums[7] / unit)
-    row[12] = 4.0 * _correction(by_speed * speed_variance * sums[7] / limit)
+    row[12] = 4.0 * _correction(by_speed * speed_variance * sums[7] / speed_unit)
     row[13] = min(density_variance * sums[8], 1.0)
     row[14] = min(by_speed**2 * speed_variance * sums[9], 1.0)
-    row[15], row[16] = slip / limit, flows
+    row[15], row[16] = slip / speed_unit, flows
     row[17] = 0.25 * np.log(1.0 + min(age, LONGEST_AGE))
 
 
@@ -376,9 +387,8 @@ def advance(bundle: Bundle, episodes: IntArray, x: Float32Array) -> None:
         np.dot(h, weights.heads, raw)
         for s in range(S):
             row = raw[s]
-            unit, limit = cells.unit[s], cells.limit
-            _read_heads(row[0:4], weights.heads_bias[0:4], unit, limit, present[episodes[i], s])
-            _read_heads(row[4:8], weights.heads_bias[4:8], unit, limit, ahead[episodes[i], s])
+            _read_heads(row[0:4], weights.heads_bias[0:4], cells, s, present[episodes[i], s])
+            _read_heads(row[4:8], weights.heads_bias[4:8], cells, s, ahead[episodes[i], s])
 
 
 @kernel_part(fastmath={"contract"})
@@ -414,10 +424,11 @@ def _tanh(x: np.float32) -> np.float32:
 
 @kernel_part
 def _read_heads(
-    raw: Float32Array, bias: Float32Array, unit: float, limit: float, out: FloatArray
+    raw: Float32Array, bias: Float32Array, cells: Cells, s: int, out: FloatArray
 ) -> None:
     """Write density, speed and their deviations from the outputs of four heads."""
+    unit, speed_unit = cells.unit[s], cells.speed_unit
     out[0] = DENSITY_RANGE * unit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[0] + bias[0])))
-    out[1] = SPEED_RANGE * limit * (0.5 + 0.5 * np.tanh(0.5 * float(raw[1] + bias[1])))
+    out[1] = cells.fastest * (0.5 + 0.5 * np.tanh(0.5 * float(raw[1] + bias[1])))
     out[2] = unit * np.exp(clip(float(raw[2] + bias[2]), LOWEST_SPREAD, HIGHEST_SPREAD))
-    out[3] = limit * np.exp(clip(float(raw[3] + bias[3]), LOWEST_SPREAD, HIGHEST_SPREAD))
+    out[3] = speed_unit * np.exp(clip(float(raw[3] + bias[3]), LOWEST_SPREAD, HIGHEST_SPREAD))
