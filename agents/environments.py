@@ -183,7 +183,8 @@ def settings_of(env: str, keywords: Mapping[str, Any]) -> str:
         return config.settings_name
     if config.estimator == "recurrent":
         weights = config.settings().recurrent.weights
-        saved = weights_for(weights, config.corridor.road, config.releases_flow)
+        flows, own = config.releases_flow, config.parameters.is_own
+        saved = weights_for(weights, config.corridor.road, flows=flows, own=own)
         return f"weights {saved.source}"
     if config.estimator_settings is None:
         return "defaults"

@@ -89,7 +89,7 @@ class EnvConfig:
     Attributes:
         corridor: The road, its demand, incident and fixed sensors.
         estimator: The estimator: ``ekf``, ``ukf``, ``enkf``, ``mhe``, ``random_walk``,
-            ``blend``, ``open_loop``, ``recurrent``, ``asm``, ``mixture``, a registered name,
+            ``blend``, ``open_loop``, ``recurrent``, ``asm``, a registered name,
             ``"package.module:Class"``, or a class.
         backend: ``compiled``, or ``reference``, which EKF, UKF, EnKF and MHE have.
         parameters: ARZ parameters; a name stands for a shipped set.
@@ -733,6 +733,7 @@ def _played(config: EnvConfig) -> Played:
     headways = [each.headway for each in own or [conditions.drivers]]
     return {
         "flows": (config.releases_flow,),
+        "own_parameters": (config.parameters.is_own,),
         "span": (max(config.query_spans),),
         "epsilon": (config.privacy.epsilon,),
         "connected": share if isinstance(share, tuple) else (share,),

@@ -65,8 +65,7 @@ class Recurrent(SegmentEstimator):
     def __init__(self, model: ARZModel, n_episodes: int, settings: EstimatorSettings) -> None:
         """See `make_estimator`."""
         super().__init__(model, n_episodes, settings)
-        flows = model.releases_flow
-        self.saved = weights_for(settings.recurrent.weights, model.road, flows)
+        self.saved = _weights_of(model, settings)
         S, n = model.n_segments, n_episodes
         memory = Memory(
             inputs=np.zeros((n, model.n_inputs)),
@@ -96,13 +95,13 @@ class Recurrent(SegmentEstimator):
     @staticmethod
     def check_settings(model: ARZModel, settings: EstimatorSettings) -> None:
         """Refuse weights that are missing or cannot be read."""
-        flows = model.releases_flow
-        weights_for(settings.recurrent.weights, model.road, flows)
+        _weights_of(model, settings)
 
     @classmethod
     def inherits(cls, road: Road, played: Played, settings: EstimatorSettings) -> dict[str, str]:
         """Return the setting of the weights where their card does not name what is played."""
-        saved = weights_for(settings.recurrent.weights, road, bool(played["flows"][0]))
+        flows, own = (bool(played[name][0]) for name in ("flows", "own_parameters"))
+        saved = weights_for(settings.recurrent.weights, road, flows=flows, own=own)
         beyond = ", ".join(
             f"{name} {where}" for name, where in outside(saved, road, played).items()
         )
@@ -146,13 +145,19 @@ class SavedWeights:
     source: str
 
 
-def weights_for(source: str | None, road: Road, flows: bool) -> SavedWeights:
+def _weights_of(model: ARZModel, settings: EstimatorSettings) -> SavedWeights:
+    flows, own = model.releases_flow, model.parameters.is_own
+    return weights_for(settings.recurrent.weights, model.road, flows=flows, own=own)
+
+
+def weights_for(source: str | None, road: Road, *, flows: bool, own: bool) -> SavedWeights:
     """Return the weights of a setting for a road: of `SHIPPED` the first that suit it, if None.
 
     Args:
         source: The setting `RecurrentSettings.weights`.
         road: The road.
         flows: Whether flows are released, not speeds.
+        own: Whether the parameters are the road's own.
 
     Raises:
         ValueError: See `read_weights`.
@@ -160,8 +165,9 @@ def weights_for(source: str | None, road: Road, flows: bool) -> SavedWeights:
     if source is not None:
         return read_weights(member_for(source, flows))
     members = (member_for(name, flows) for name in SHIPPED)
+    played = {"flows": (flows,), "own_parameters": (own,)}
     for saved in (read_weights(each) for each in members if each in shipped_weights()):
-        if not outside(saved, road, {"flows": (flows,)}):
+        if not outside(saved, road, played):
             break
     return saved
 

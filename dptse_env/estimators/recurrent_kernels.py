@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dptse_env.estimators.base import Measurement
-from dptse_env.model import ARZ, ARZModel, available_parameters
+from dptse_env.model import ARZ, ARZModel
 from dptse_env.model.step import clip
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, all_finite, inline_part, kernel, kernel_part
@@ -67,8 +67,8 @@ DENSITY_UNIT = 40.0
 DENSITY_RANGE = 4.0
 """Largest density that is estimated, in its unit: vehicles that stand, 6.25 m each."""
 SPEED_RANGE, OWN_SPEED_RANGE = 1.1, 1.4
-"""Largest speed that is estimated, in limits, or in free-flow speeds of a road's own parameters, which
-are means of all vehicles."""
+"""Largest speed that is estimated, in its unit: a limit, or the free-flow speed of a road's own
+parameters, which is a mean over all vehicles."""
 
 N_FIXED = 7
 """Number of the features of a cell that never change."""
@@ -109,7 +109,7 @@ def make_cells(model: ARZModel) -> Cells:
     marks[road.entries, 2] = 1.0
     marks[road.exits, 3] = 1.0
     lengths, lanes, limits = road.lengths[:S], road.lanes[:S], road.limits[:S]
-    own = model.parameters.name not in available_parameters()
+    own = model.parameters.is_own
     speed_unit = float(model.arz.free_flow_speed if own else limits.max())
     speeds = speed_unit * limits / limits.max()
     scales = np.stack([np.log(lengths / 0.1), np.log(speeds / 100.0)], axis=1)

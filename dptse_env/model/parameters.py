@@ -78,6 +78,11 @@ class ARZParameters:
         if self.derived_from is not None:
             require_name("parameters.derived_from", self.derived_from, available_parameters())
 
+    @property
+    def is_own(self) -> bool:
+        """True where they are a road's own, not a set that ships with the package."""
+        return self.name not in available_parameters()
+
     def largest_time_step(self, segment_length: float) -> float:
         """Return the largest time step T [s] of the CFL condition for segments of a length [km].
 

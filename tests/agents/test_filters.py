@@ -479,7 +479,7 @@ def test_a_training_may_begin_with_other_weights_and_says_so_on_the_card(tmp_pat
         ({"windows": 4}, r"windows must be an integer in 1\.\.3, got 4"),
         ({"teacher": 0.5}, "teacher must be 0 without weights that teach, got 0.5"),
         ({"kind": "densities"}, "kind must be one of flows, speeds, got 'densities'"),
-        ({"validation_highways": (5, 9)}, r"validation_highways must be .* outside of \(0, 80\)"),
+        ({"validation_highways": (5, 9)}, r"validation_highways must be .* outside of \(0, 64\)"),
         ({"initial": "nowhere"}, r"weights must be a file or one of highway, .*, got 'nowhere'"),
     ],
 )

@@ -1,5 +1,6 @@
 """The recurrent network beside the one that is trained, and what it gives."""
 
+import dataclasses
 import hashlib
 
 import numpy as np
@@ -21,6 +22,7 @@ from dptse_env.estimators.recurrent_kernels import (
     LOWEST_SPREAD,
     make_cells,
 )
+from dptse_env.model import ARZModel, load_parameters
 from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY
 from tests.hostile import check_hostile, edited
 
@@ -214,9 +216,20 @@ def test_deviations_and_estimates_stay_in_their_range(tmp_path):
     np.testing.assert_allclose(estimate.density_std[0], unit * np.exp(LOWEST_SPREAD))
 
 
+def test_a_limit_that_nobody_drives_at_makes_no_difference_to_a_calibrated_road():
+    own = dataclasses.replace(load_parameters("w99-3lane"), name="own")
+    roads = [PAPER_HIGHWAY.replaced(speed_limit=limit).road for limit in (100.0, 150.0)]
+    first, other = (make_cells(ARZModel(road, own)) for road in roads)
+    assert first.speed_unit == other.speed_unit == own.free_flow_speed
+    assert first.fastest == other.fastest == pytest.approx(1.4 * own.free_flow_speed)
+    np.testing.assert_array_equal(first.fixed, other.fixed)
+    shipped = [make_cells(ARZModel(road, load_parameters("w99-3lane"))) for road in roads]
+    assert [each.speed_unit for each in shipped] == [100.0, 150.0]
+
+
 PLAYED = {
-    "flows": (False,), "span": (3,), "epsilon": (100.0,), "connected": (0.1, 1.0),
-    "slow_share": (0.3,), "slow_speed": (80.0,), "headway": (),
+    "flows": (False,), "own_parameters": (False,), "span": (3,), "epsilon": (100.0,),
+    "connected": (0.1, 1.0), "slow_share": (0.3,), "slow_speed": (80.0,), "headway": (),
 }  # fmt: skip
 
 
@@ -237,11 +250,11 @@ def test_what_weights_were_not_trained_on_is_named(tmp_path):
 # Files of weights ---------------------------------------------------------------------------------
 
 DIGESTS = {
-    "highway-flows": ("a7cd6a7d0da0", "463df28b4d90"),
-    "highway-speeds": ("98c08e7ad753", "2bb2c4ca118a"),
-    "long-highway-flows": ("0718f2eebe91", "af13a07e0dc6"),
-    "roads-flows": ("", "c7615b36c533"),
-    "roads-speeds": ("", "91438623f310"),
+    "highway-flows": ("a7cd6a7d0da0", "b8053dba8f85"),
+    "highway-speeds": ("98c08e7ad753", "5eabe2045192"),
+    "long-highway-flows": ("0718f2eebe91", "ce544dbbe3ab"),
+    "roads-flows": ("", "0f08b65d7ef0"),
+    "roads-speeds": ("", "8ec0243f381e"),
 }
 """The first digits of the digests of the files before they were converted, and of their weights."""
 
@@ -297,7 +310,9 @@ def test_a_pair_is_found_by_the_name_it_shares(tmp_path):
     ],
 )
 def test_the_weights_of_the_package_that_know_a_road_are_taken(road, flows, weights):
-    assert weights_for(None, road.road, flows).source == weights
+    assert weights_for(None, road.road, flows=flows, own=False).source == weights
+    own = "roads-flows" if flows else "roads-speeds"
+    assert weights_for(None, road.road, flows=flows, own=True).source == own
 
 
 def test_damaged_files_are_refused(path, tmp_path):
