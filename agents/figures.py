@@ -251,7 +251,6 @@ LABELS = {
     "random_walk": "random walk",
     "blend": "EKF and random walk",
     "asm": "adaptive smoothing",
-    "mixture": "mixture",
     "recurrent": "recurrent",
     "open_loop": "open loop",
 }

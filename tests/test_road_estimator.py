@@ -400,15 +400,6 @@ def test_an_index_out_of_range_is_no_memory(field):
         estimator.check_memory()
 
 
-def test_a_mixture_knows_the_ranges_of_its_experts():
-    experts = {"mixture": {"experts": ["mhe", "asm"]}}
-    memory = played(make("mixture", estimator_settings=experts), 3).save()
-    with pytest.raises(ValueError, match=r"^state: memory\[\d+\] must be in "):
-        make("mixture", estimator_settings=experts).load(
-            forged(memory, lambda array: np.full_like(array, 63))
-        )
-
-
 @pytest.mark.parametrize("problem", [KeyboardInterrupt, RuntimeError])
 def test_a_step_or_a_restart_that_ends_early_changes_nothing(monkeypatch, problem):
     road, same = (played(make("ekf"), 130) for _ in range(2))

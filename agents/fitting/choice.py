@@ -26,7 +26,7 @@ FILTER, ROUND_ROBIN = "ekf", "round-robin"
 """Estimator and query policy with which parameters are fitted."""
 
 ESTIMATORS_TRIED = (
-    "ekf", "random_walk", "asm", "blend", "ukf", "enkf", "mhe", "recurrent", "mixture",
+    "ekf", "random_walk", "asm", "blend", "ukf", "enkf", "mhe", "recurrent",
 )  # fmt: skip
 """Estimators among which a fit chooses, the simplest first."""
 

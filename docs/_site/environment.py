@@ -46,7 +46,7 @@ SHOWN = slice(270, 410)  # seconds
 SECOND = 300
 
 ESTIMATORS = (
-    "recurrent", "mixture", "blend", "ukf", "enkf", "ekf", "mhe", "asm", "random_walk",
+    "recurrent", "blend", "ukf", "enkf", "ekf", "mhe", "asm", "random_walk",
 )  # fmt: skip
 
 
@@ -70,7 +70,7 @@ def draw_estimators() -> Figure:
     for axis, (title, errors) in zip(axes, found.items(), strict=True):
         for place, name in enumerate(ESTIMATORS):
             if name in errors:
-                colour = ORANGE if name in {"recurrent", "mixture"} else BLUE
+                colour = ORANGE if name == "recurrent" else BLUE
                 draw_dot(axis, errors[name], -place, colour, name)
         axis.set_title(title, fontsize=9, loc="left")
         axis.set_xlabel("error x 1000", fontsize=9)

@@ -18,7 +18,6 @@ from dptse_env.estimators.settings import (
     EnsembleSettings,
     EstimatorSettings,
     HorizonSettings,
-    MixtureSettings,
     RecurrentSettings,
     SigmaPointSettings,
 )
@@ -41,7 +40,6 @@ __all__ = [
     "HorizonSettings",
     "KernelEstimator",
     "Measurement",
-    "MixtureSettings",
     "Played",
     "RecurrentSettings",
     "SigmaPointSettings",
@@ -72,7 +70,6 @@ ESTIMATORS = Registry(
         "open_loop": "dptse_env.estimators.simple:OpenLoop",
         "recurrent": "dptse_env.estimators.recurrent:Recurrent",
         "asm": "dptse_env.estimators.asm:AdaptiveSmoothing",
-        "mixture": "dptse_env.estimators.mixture:Mixture",
     },
     check=_expected,
 )
@@ -149,7 +146,7 @@ def make_estimator(
     Args:
         estimator: `ekf`, `ukf`, `enkf`, `mhe`, `random_walk` (no traffic model), `blend` (a mean
             of EKF and random walk), `open_loop` (no measurements), `recurrent` (a neural network),
-            `asm` (adaptive smoothing), `mixture` (of others), a registered name,
+            `asm` (adaptive smoothing), a registered name,
             ``"package.module:Class"`` or a class.
         backend: `compiled` (numba), or `reference` (filterpy, qpsolvers, numpy), which EKF, UKF,
             EnKF and MHE have.

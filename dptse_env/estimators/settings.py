@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 from dptse_env.model import Bounds
-from dptse_env.utils.validation import Interval, checked_fields, shown
+from dptse_env.utils.validation import Interval, checked_fields
 
 Linearisation = Literal["published", "trajectory"]
 
@@ -175,30 +175,6 @@ class AdaptiveSmoothingSettings(_Checked, path=f"{PATH}.asm"):
 
 
 @dataclass(frozen=True)
-class MixtureSettings(_Checked, path=f"{PATH}.mixture"):
-    """Settings of the mixture.
-
-    Attributes:
-        experts: Two or more names of estimators or of weights (`RecurrentSettings`), which share
-            all other settings; None for the weights that `recurrent` takes on the road, and
-            ``roads``. Where it takes these, ``highway`` is the other expert.
-        memory: Seconds in which likelihoods are forgotten.
-    """
-
-    experts: tuple[str, ...] | None = None
-    memory: Annotated[float, Interval(2, 3600)] = 60.0
-
-    def __post_init__(self) -> None:
-        """Check values; lists become tuples."""
-        super().__post_init__()
-        if self.experts is not None and (len(self.experts) < 2 or "mixture" in self.experts):
-            raise ValueError(
-                f"{PATH}.mixture.experts must be two or more names of other estimators or of "
-                f"weights, got {shown(self.experts)}"
-            )
-
-
-@dataclass(frozen=True)
 class EstimatorSettings(_Checked, path=PATH):
     """Tuning of the estimators, in units of the jam density rho_m and of v_f.
 
@@ -229,7 +205,6 @@ class EstimatorSettings(_Checked, path=PATH):
         recurrent: Settings of the recurrent network; of the others it has `initial_variance`,
             `noise_scale` and `speed_cap`.
         asm: Settings of adaptive smoothing, which has the same ones of the others.
-        mixture: Settings of the mixture, whose experts share the others.
     """
 
     process_noise: tuple[Deviation, Deviation] = (0.01, 0.01)
@@ -247,4 +222,3 @@ class EstimatorSettings(_Checked, path=PATH):
     blend: BlendSettings = field(default_factory=BlendSettings)
     recurrent: RecurrentSettings = field(default_factory=RecurrentSettings)
     asm: AdaptiveSmoothingSettings = field(default_factory=AdaptiveSmoothingSettings)
-    mixture: MixtureSettings = field(default_factory=MixtureSettings)

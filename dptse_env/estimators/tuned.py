@@ -15,7 +15,6 @@ from typing import Any
 
 from dptse_env.estimators.settings import PATH, EstimatorSettings
 from dptse_env.model import ARZParameters, available_parameters, load_parameters
-from dptse_env.utils.registry import require_registered_experts
 from dptse_env.utils.validation import check_object, cut, from_mapping, read_json, shown, within
 
 _KEYS = {"estimator": str, "settings": dict, "provenance": dict}
@@ -176,6 +175,4 @@ def _entry(content: Any, path: str) -> dict[str, Any]:
 
 def _parse(entry: Mapping[str, Any], path: str) -> EstimatorSettings:
     with within(f"{path}: "):
-        found = from_mapping(EstimatorSettings, entry["settings"], PATH)
-        require_registered_experts(entry["settings"], PATH)
-    return found
+        return from_mapping(EstimatorSettings, entry["settings"], PATH)

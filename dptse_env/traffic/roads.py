@@ -25,7 +25,7 @@ from dptse_env.geometry import Geometry
 from dptse_env.traffic.corridor import Conditions, Corridor, Scales
 from dptse_env.traffic.demand import Demand, DemandDistribution, Incident, IncidentDistribution
 from dptse_env.utils.files import write_atomically
-from dptse_env.utils.registry import Registry, require_registered, require_registered_experts
+from dptse_env.utils.registry import Registry, require_registered
 from dptse_env.utils.validation import read_toml, require, within
 
 SUFFIX = ".toml"
@@ -169,8 +169,6 @@ def read_road(path: str | os.PathLike[str]) -> RoadFile:
         try:
             for key in PARTS:
                 require_registered(environment.get(key), f"{_ENVIRONMENT}.{key}")
-            name = "estimator_settings"
-            require_registered_experts(environment.get(name), f"{_ENVIRONMENT}.{name}")
             home = path.resolve().parent
             keywords = {key: _absolute(value, home) for key, value in environment.items()}
         except RecursionError as problem:

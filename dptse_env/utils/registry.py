@@ -165,20 +165,6 @@ def require_registered(value: Any, path: str) -> None:
             require_registered(each, f"{path}[{i}]")
 
 
-def require_registered_experts(settings: Any, path: str) -> None:
-    """Refuse settings of an estimator from a file that name an expert by ``"module:Name"``.
-
-    Raises:
-        ValueError: They do; the message starts with the path of the expert.
-    """
-    for key in ("mixture", "experts"):
-        settings, path = (
-            settings.get(key) if isinstance(settings, Mapping) else None,
-            f"{path}.{key}",
-        )
-    require_registered(settings, path)
-
-
 def name_of_class(part: Any) -> str:
     """Return ``"package.module:Name"`` of a class or function, or of the class of an object."""
     if isinstance(part, str):

@@ -54,8 +54,6 @@ FAST = [
 ]
 CASES = [(*each, "speed") for each in EVERY]
 CASES += [(name, "compiled", kind) for name in ESTIMATORS for kind in ("flow", "rows")]
-LEARNED = ("recurrent", "mixture")
-"""Estimators whose estimates are those of trained weights."""
 MODEL = model_of("published", "speed")
 
 
@@ -110,7 +108,7 @@ def test_every_name_and_backend_follows_the_protocol(name, backend):
 
 def test_unknown_names_say_what_is_allowed():
     for name, backend, n, message in (
-        ("kf", "compiled", 1, r"estimator must be one of ekf, .*, mixture, or.*, got 'kf'"),
+        ("kf", "compiled", 1, r"estimator must be one of ekf, .*, asm, or.*, got 'kf'"),
         ("ekf", "torch", 1, "backend must be one of compiled, reference, got 'torch'"),
         ("ekf", "compiled", 0, "n_episodes must be >= 1, got 0"),
     ):
@@ -231,7 +229,7 @@ def test_who_does_not_say_what_it_remembers_is_named():
 
 
 @over(
-    ("random_walk", "open_loop", "recurrent", "asm", "mixture"),
+    ("random_walk", "open_loop", "recurrent", "asm"),
     cases=[c for c in CASES if c[2] != "rows"],
 )
 def test_covariance_is_one_over_recorded_traffic(name, backend, release):
@@ -269,7 +267,7 @@ def test_poor_starts_and_ten_times_the_noise_stay_finite_and_within_bounds(
         for field in Snapshot._fields:
             assert np.isfinite(getattr(shown, field)).all(), field
         assert (np.minimum(shown.density, shown.speed) >= 0.0).all()
-        if name in LEARNED:  # have a range of their own
+        if name == "recurrent":  # has a range of its own
             return
         assert (shown.density <= model.jam_density * (1.0 + 1e-12)).all()
         assert (shown.speed <= model.largest_speed * (1.0 + 1e-12)).all()
@@ -320,7 +318,7 @@ def test_what_is_no_number_diverges_that_episode_only(name, backend, release):
 # Measurements -------------------------------------------------------------------------------------
 
 
-@over(LEARNED)
+@over(("recurrent",))
 def test_an_empty_set_of_measurements_leaves_the_prediction(name, backend, release):
     episodes = simulate(n_steps=14, release=release)
     estimator = started(name, backend, episodes)
@@ -443,7 +441,7 @@ def test_a_cap_holds_the_reported_speeds_and_nothing_else(name, backend):
             step(one, episodes, k)
         expected, found = show(plain), show(held)
         assert (expected.speed > largest).any()
-        assert (found.speed < largest).any() or name in LEARNED
+        assert (found.speed < largest).any() or name == "recurrent"
         speed = np.minimum(expected.speed, largest)
         if name == "blend":  # a mean of speeds that are held already
             assert (found.speed <= speed).all()

@@ -47,7 +47,6 @@ FILE = {"mhe-published-corrected": ENTRY}
         ("bounds", "ball", r"bounds must be one of cone, box, got 'ball'"),
         ("mhe", {"arrival_noise": [0.1, 0.0]}, r"mhe\.arrival_noise\[1\] must be .*, got 0\.0"),
         ("enkf", {"n_member": 50}, r"enkf\.n_member is unknown; allowed: n_members"),
-        ("mixture", {"experts": "ekf"}, r"mixture\.experts must be a sequence or None, got 'ekf'$"),
     ],
 )
 def test_a_bad_setting_is_named(field, value, message):
@@ -104,10 +103,6 @@ def test_a_written_set_reads_back_over_the_defaults(tmp_path):
     [
         ({"process_noise": [-1.0, 0.1]}, r"process_noise\[0\] must be a number in "),
         ({"mhe": {"horizons": 3}}, r"mhe\.horizons is unknown; allowed: "),
-        (
-            {"mixture": {"experts": ["ekf", "own:Part"]}},
-            r"mixture\.experts\[1\] must be a registered name \(",
-        ),
     ],
 )
 def test_bad_settings_are_neither_written_nor_read(settings, message, tmp_path):

@@ -179,7 +179,7 @@ def test_readings_come_at_the_ends_of_intervals_alone():
 # --- what rules and reports see -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "mixture"])
+@pytest.mark.parametrize("estimator", ["ekf", "recurrent"])
 def test_a_reading_is_no_query(estimator):
     """Ages, queries and releases are those without loops; innovations those of releases alone."""
     given = {"estimator": estimator, "privacy": COUNTED}

@@ -108,11 +108,6 @@ def test_bad_files_are_refused_by_file_and_field(road, old, new, message):
         ("observation", '["default", "own:Part"]', r"\[1\]"),
         ("privacy", '{ preset = "own:Part" }', r"\.preset"),
         ("reward", '"own:Part"', ""),
-        (
-            "estimator_settings",
-            '{ mixture = { experts = ["ekf", "own:Part"] } }\nestimator = "mixture"',
-            r"\.mixture\.experts\[1\]",
-        ),
     ],
 )
 def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
@@ -139,7 +134,7 @@ def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
         ("bandwidth = 0", r"environment\.bandwidth must be an integer in 1"),
         (
             'estimator = "best"',
-            r"environment\.estimator must be one of .*, mixture, or, .*, got 'best'",
+            r"environment\.estimator must be one of .*, asm, or, .*, got 'best'",
         ),
         ("epsilon = 0", r"environment\.privacy\.epsilon must be"),
         ('incident = "some"', r"environment\.corridor\.incident must be one of"),
@@ -149,10 +144,6 @@ def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
         (
             'estimator = "recurrent"\nestimator_settings = { recurrent = { weights = "x" } }',
             r"environment\.estimator_settings\.recurrent\.weights must be a file or .*, got 'x'",
-        ),
-        (
-            'estimator = "mixture"\nestimator_settings = { mixture = { experts = ["ekf", "x"] } }',
-            r"environment\.estimator_settings\.mixture\.experts: .* must be a file or .*, got 'x'",
         ),
     ],
 )

@@ -49,7 +49,7 @@ from dptse_env.utils.files import file_digest
 from dptse_env.utils.validation import convert
 
 SEEDS, MORE_SEEDS = tuple(range(2000, 2008)), tuple(range(2000, 2016))
-FILTERS, RECURRENT, MIXTURE = ("ekf", "blend", "asm"), "recurrent", "mixture"
+FILTERS, RECURRENT = ("ekf", "blend", "asm"), "recurrent"
 ALL_FILTERS = ("ekf", "ukf", "enkf", "mhe", "blend", "asm")
 """Filters on drawn roads."""
 PACED, CORRECTED = "paced", "corrected"
@@ -63,20 +63,6 @@ RELEASES: dict[str, dict[str, Any]] = {
 }
 """Keywords of the release models, which are those of the environments that come with them."""
 
-
-class Learned(NamedTuple):
-    """An estimator with weights; those of the package if none are named."""
-
-    estimator: str
-    network: str = ""
-
-    def __str__(self) -> str:
-        """Return its name in tables."""
-        return f"`{self.estimator}` {self.network}".rstrip()
-
-
-SHIPPED = (Learned(RECURRENT), Learned(MIXTURE))
-"""Those that come with the package."""
 
 _Part = tuple[dict[str, Any], tuple[int, ...]]
 
@@ -183,7 +169,7 @@ def study(weights: Sequence[str] = ()) -> Study:
         ValueError: They are no list of texts.
     """
     weights = convert(tuple[str, ...], weights, "weights")
-    who = [(name, "", "") for name in (*ALL_FILTERS, RECURRENT, MIXTURE)]
+    who = [(name, "", "") for name in (*ALL_FILTERS, RECURRENT)]
     who += [(RECURRENT, named(each), each) for each in weights]
     cells = []
     for (name, release), (estimator, network, own) in product(lines(ROADS), who):
@@ -222,28 +208,28 @@ def best_filter(rows: pl.DataFrame, road: str, release: str) -> str:
     return min(filters, key=lambda name: mean(rows, on_road(road, release, name), ERROR).mean)
 
 
-def gain(rows: pl.DataFrame, learned: Learned, road: str, release: str) -> Interval:
-    """Return by how much an error lies below that of the best filter [%], paired.
+def gain(rows: pl.DataFrame, network: str, road: str, release: str) -> Interval:
+    """Return by how much the error of a network lies below that of the best filter [%], paired.
 
     Raises:
         UnmeasuredError: Something was not played there.
     """
     best = on_road(road, release, best_filter(rows, road, release))
-    return below(rows, on_road(road, release, *learned), best)
+    return below(rows, on_road(road, release, RECURRENT, network), best)
 
 
-def learned_in(rows: pl.DataFrame) -> list[Learned]:
-    """Return the estimators with weights that were played, those of the package first."""
+def networks_in(rows: pl.DataFrame) -> list[str]:
+    """Return the names of the networks that were played; that of the package, "", comes first."""
     own = rows.filter(pl.col("estimator") == RECURRENT, pl.col("network") != "")
-    return [*SHIPPED, *(Learned(RECURRENT, name) for name in own["network"].unique().sort())]
+    return ["", *own["network"].unique().sort()]
 
 
-def table_of(rows: pl.DataFrame, learned: Learned, roads: Iterable[str] = (*OWN, *OTHERS)) -> str:
-    """Return the table of an estimator with weights beside the filters of some roads."""
-    own, filters = learned.estimator, ROADS[next(iter(roads))].filters
+def table_of(rows: pl.DataFrame, network: str, roads: Iterable[str] = (*OWN, *OTHERS)) -> str:
+    """Return the table of a network beside the filters of some roads."""
+    filters = ROADS[next(iter(roads))].filters
 
     def of(estimator: str, line: tuple[str, str]) -> Labels:
-        return on_road(*line, estimator, learned.network if estimator == own else "")
+        return on_road(*line, estimator, network if estimator == RECURRENT else "")
 
     def error(estimator: str, line: tuple[str, str]) -> str:
         return give_or_take(mean(rows, of(estimator, line), ERROR))
@@ -252,27 +238,27 @@ def table_of(rows: pl.DataFrame, learned: Learned, roads: Iterable[str] = (*OWN,
         return chi2_text(rows, of(estimator, line))
 
     def density_ratio(line: tuple[str, str]) -> str:
-        errors = [mean(rows, of(each, line), DENSITY).mean for each in (own, "ekf")]
+        errors = [mean(rows, of(each, line), DENSITY).mean for each in (RECURRENT, "ekf")]
         return f"{errors[0] / errors[1]:.2f}"
 
     columns: dict[str, Callable[[tuple[str, str]], str]] = {
         GUARANTEE: lambda line: guarantee_of(PRIVATE, RELEASES[line[1]]),
-        **{LABELS[name]: partial(error, name) for name in (*filters, own)},
-        "below best filter [%]": lambda line: tenths(gain(rows, learned, *line)),
-        **{f"χ² of {LABELS[name]}": partial(honesty, name) for name in (filters[-1], own)},
+        **{LABELS[name]: partial(error, name) for name in (*filters, RECURRENT)},
+        "below best filter [%]": lambda line: tenths(gain(rows, network, *line)),
+        **{f"χ² of {LABELS[name]}": partial(honesty, name) for name in (filters[-1], RECURRENT)},
         "density RMSE over EKF's": density_ratio,
     }
     heads = {f"{line[0]}{'*' * (line[0] in KEPT_BACK)}, {line[1]}": line for line in lines(roads)}
     return table("", heads, columns)
 
 
-def losses(rows: pl.DataFrame, learned: Learned) -> str:
-    """Return a sentence on how often an estimator errs more than the best filter on drawn roads.
+def losses(rows: pl.DataFrame, network: str) -> str:
+    """Return a sentence on how often a network errs more than the best filter on drawn roads.
 
     Raises:
         UnmeasuredError: Something was not played.
     """
-    gains = [gain(rows, learned, road, release) for road, release in lines(DRAWN)]
+    gains = [gain(rows, network, road, release) for road, release in lines(DRAWN)]
     total, n_lost = np.mean([each.mean for each in gains]), sum(each.high < 0.0 for each in gains)
     return (
         f"{total:.1f} % below the best filter in the mean. It errs more, beyond the interval, on "
@@ -280,7 +266,7 @@ def losses(rows: pl.DataFrame, learned: Learned) -> str:
     )
 
 
-def summary(rows: pl.DataFrame, learned: Learned) -> str:
+def summary(rows: pl.DataFrame, network: str) -> str:
     """Return a sentence for each release model on the own roads together.
 
     Raises:
@@ -291,10 +277,10 @@ def summary(rows: pl.DataFrame, learned: Learned) -> str:
         gains, worst = {}, {}
         for road in OWN:
             with contextlib.suppress(UnmeasuredError):
-                gains[road] = gain(rows, learned, road, release).mean
-                worst[road] = max(chi2(rows, on_road(road, release, *learned)))
+                gains[road] = gain(rows, network, road, release).mean
+                worst[road] = max(chi2(rows, on_road(road, release, RECURRENT, network)))
         if not gains:
-            raise UnmeasuredError(learned)
+            raise UnmeasuredError(network)
         least, largest = min(gains, key=gains.__getitem__), max(worst, key=worst.__getitem__)
         said.append(
             f"`{release}`: {np.mean([*gains.values()]):.1f} % below the best filter in the mean "
@@ -310,7 +296,7 @@ def draw_gains(rows: pl.DataFrame) -> Figure:
     names = list(dict.fromkeys(road for road, _ in lines()))
     series = {
         release: {
-            road: {label: gain(rows, Learned(RECURRENT), road, release)}
+            road: {label: gain(rows, "", road, release)}
             for road in names
             if release in ROADS[road].releases
         }
@@ -320,14 +306,15 @@ def draw_gains(rows: pl.DataFrame) -> Figure:
 
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
-    """Return a table for each estimator with weights, and draw the gains of `recurrent`."""
+    """Return a table for each network, and draw the gains of `recurrent`."""
     title = f"The network below the best filter, {PACED} at ε = {RELEASES[PACED]['epsilon']:g}"
     save_measured(folder / "fig_roads.png", f"{title}, 95 % intervals", draw_gains, rows)
     parts = ["# Roads that nobody trained on", NOTES, "![Gains](fig_roads.png)"]
-    for each in learned_in(rows):
-        parts += [f"## {each}", cell(summary, rows, each), table_of(rows, each)]
+    for each in networks_in(rows):
+        name = f"`{RECURRENT}` {each}".rstrip()
+        parts += [f"## {name}", cell(summary, rows, each), table_of(rows, each)]
         if not rows.filter(pl.col("road").is_in(list(DRAWN))).is_empty():
-            parts += [f"### {each} on drawn roads", cell(losses, rows, each)]
+            parts += [f"### {name} on drawn roads", cell(losses, rows, each)]
             parts.append(table_of(rows, each, DRAWN))
     return "\n\n".join(parts)
 

@@ -51,7 +51,7 @@ def test_drawn_roads_are_no_training_roads_and_have_all_filters():
         for cell in roads.study().cells
         if cell.labels["road"] in roads.DRAWN
     }
-    assert played == {*roads.ALL_FILTERS, "recurrent", "mixture"}
+    assert played == {*roads.ALL_FILTERS, "recurrent"}
 
 
 def test_all_roads_are_played():
@@ -86,14 +86,13 @@ def test_tables_have_the_numbers_of_the_rows(rows):
     }
     best = roads.best_filter(rows, *line)
     assert errors[best] == min(errors.values())
-    learned = roads.Learned("recurrent")
-    network = pick(rows, on_road(*line, *learned))
-    found = roads.gain(rows, learned, *line)
+    network = pick(rows, on_road(*line, "recurrent"))
+    found = roads.gain(rows, "", *line)
     own = -1000.0 * network["reward"].mean()
     assert found.mean == pytest.approx(100.0 * (1.0 - own / errors[best]))
     (entry,) = (
         text
-        for text in roads.table_of(rows, learned).splitlines()
+        for text in roads.table_of(rows, "").splitlines()
         if text.startswith("| six ramps, paced |")
     )
     assert all(f"| {each:.1f} ± " in entry for each in (*errors.values(), own))
@@ -103,8 +102,8 @@ def test_tables_have_the_numbers_of_the_rows(rows):
 
 def test_the_summary_is_the_mean_over_own_roads_that_were_played(rows):
     some = rows.filter(road="six ramps")
-    gain = roads.gain(some, roads.SHIPPED[1], "six ramps", "paced").mean
-    said = roads.summary(some, roads.SHIPPED[1])
+    gain = roads.gain(some, "", "six ramps", "paced").mean
+    said = roads.summary(some, "")
     assert f"`paced`: {gain:.1f} % below" in said
     assert "over 1 own roads" in said
 
