@@ -114,9 +114,8 @@ class Section:
     def parameters(self, library: RecordLibrary) -> ARZParameters:
         """Return parameters whose equilibrium speeds are about those of its highway.
 
-        The free-flow speed is 3 % off, and 12 % on one of five sections.
-
-        What a search of parameters finds lies near them, and takes a thousand times as long.
+        Their free-flow speed is 3 % off, on one section of five 12 %. A search of parameters finds
+        such ones in a thousand times the time.
         """
         corridor = draw_highway(self.highway, self.kind).corridor
         start = start_from(load_parameters(DEFAULT_PARAMETERS), corridor, "fitted")
