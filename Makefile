@@ -21,16 +21,10 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-DEMO = --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}'
+demo: setup  ## Train a query policy for two minutes and compare it with rules on other traffic; results/demo.
+	$(BIN)/python examples/demo.py
 
-demo: setup  ## Train a query policy for a minute and compare it with rules on other traffic; results/demo.
-	$(BIN)/dptse train $(DEMO) --minutes 1 --algorithm 'ppo {"validations": 8}' \
-		--train-seeds 0:48 --validation-seeds 1000:1016 --output results/demo/training
-	$(BIN)/dptse evaluate $(DEMO) --policies results/demo/training/best.safetensors \
-		random round-robin oldest-first stale-variance largest-density-variance speed-front \
-		--test-seeds 2000:2032 --reference speed-front --output results/demo --force
-
-pictures: demo  ## Draw the pictures of the pages anew; docs/images.
+pictures: setup  ## Draw the pictures of the pages anew; docs/images.
 	$(BIN)/python docs/_site/pictures.py
 
 reproduce: setup  ## Write the reports of all studies anew, after playing what their rows lack; results/.

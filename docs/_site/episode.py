@@ -1,12 +1,12 @@
 """Draw an episode as a moving picture, and one second of it: docs/images/episode.gif and .png.
 
-A policy that ships with the package queries two of fifteen segments a second, under ``paced``. An
-incident stops the traffic on one of them.
+A rule queries two of fifteen segments a second, under ``paced``. An incident stops the traffic on
+one of them. Below are the errors of the rule and of the paper's schedule, with the same estimator.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,14 +26,15 @@ from agents.page import watch
 from agents.play import Cell
 from dptse_env.rendering import History
 from dptse_env.traffic.scenario import draw_scenario
+from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import replacing
 
 CELL = Cell(
     "dptse_env:dptse/PrivateHighway-v1",
-    "private-highway",
+    "expected-reduction",
     {"bandwidth": 2, "estimator": "recurrent"},
-    transferred=True,
 )
+BASELINE = "shift-ahead"
 SEED, STILL = 2009, 284
 SECONDS = range(120, 500, 4)
 FRAME = 110  # milliseconds
@@ -45,7 +46,9 @@ STRIPS = {
     QUERIES: ("queries", "two a second"),
     ESTIMATE: ("estimate", "from noisy sums"),
 }
+LINES = {"paper's schedule": (COLOURS[1], 1.5), "this rule": (INK, 2.0)}
 LARGEST = 200.0  # density at the end of the colours [veh/km]
+MEMORY = 20  # seconds over which errors are averaged
 LEFT, RIGHT = 0.145, 0.905  # of the road and the curve, as shares of the width
 
 
@@ -55,12 +58,14 @@ class Scene:
 
     Attributes:
         history: The episode.
+        baseline: Density errors of the paper's schedule in it [veh/km].
         segment: Where the incident is.
         start: When it blocks the road [s].
         end: When it stops to [s].
     """
 
     history: History
+    baseline: FloatArray
     segment: int
     start: float
     end: float
@@ -71,7 +76,14 @@ def play() -> Scene:
     corridor = make_config(CELL.env, dict(CELL.keywords)).corridor
     (incident,) = draw_scenario(corridor, SEED).incidents
     start, end, _ = incident.phases[0]
-    return Scene(watch("", CELL, SEED).history, incident.segment, start, end)
+    other = watch("", replace(CELL, policy=BASELINE), SEED).history.rmse
+    return Scene(watch("", CELL, SEED).history, np.asarray(other), incident.segment, start, end)
+
+
+def smooth(errors: FloatArray) -> FloatArray:
+    """Return the roots of mean squared errors over the last seconds."""
+    squares = np.cumsum(np.square(errors))
+    return np.sqrt((squares[MEMORY:] - squares[:-MEMORY]) / MEMORY)
 
 
 def add_strip(axes: Axes, bottom: float, height: float, n: int) -> PatchCollection:
@@ -112,11 +124,15 @@ class Film:
         )  # fmt: skip
         self._add_bar()
         curve = self.figure.add_axes((LEFT, 0.125, RIGHT - LEFT, 0.185))
-        (self.curve,) = curve.plot([], [], color=INK, lw=1.5)
-        (self.point,) = curve.plot([], [], "o", color=INK, ms=5, clip_on=False)
-        self.error = curve.text(
-            1, 1.02, "", size=10, weight="bold", ha="right", color=INK, transform=curve.transAxes
-        )
+        self.curves = [
+            curve.plot([], [], color=colour, lw=width)[0] for colour, width in LINES.values()
+        ]
+        self.errors = [
+            curve.text(
+                at, 1.06, "", size=10, weight="bold", color=colour, transform=curve.transAxes
+            )
+            for at, (colour, _) in zip((0, 0.5), LINES.values(), strict=True)
+        ]
         curve.set(xlim=(SECONDS[0], SECONDS[-1]), ylim=(0, 30), yticks=(0, 10, 20, 30))
         curve.set_xlabel("time [s]", size=9)
         curve.set_ylabel("density error\n[veh/km]", size=9)
@@ -141,10 +157,14 @@ class Film:
         )
         self.incident.set_visible(scene.start <= second < scene.end)
         self.clock.set_text(f"second {second}")
-        errors = history.rmse[: second + 1]
-        self.curve.set_data(range(SECONDS[0], second + 1), errors[SECONDS[0] :])
-        self.point.set_data([second], errors[-1:])
-        self.error.set_text(f"error now: {errors[-1]:.0f} veh/km")
+        both = (scene.baseline, np.asarray(history.rmse))
+        for errors, curve, text, name in zip(both, self.curves, self.errors, LINES, strict=True):
+            curve.set_data(
+                range(SECONDS[0], second + 1),
+                smooth(errors[SECONDS[0] - MEMORY : second + 1]),
+            )
+            mean = np.sqrt(np.mean(np.square(errors[SECONDS[0] : second + 1])))
+            text.set_text(f"{name}: {mean:.1f} veh/km")
         self.canvas.draw()
         return Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3].copy())
 

@@ -3,7 +3,7 @@
 python docs/_site/notebook.py
 
 Where `[project.urls]` of pyproject.toml has the Repository, the tutorial gets a link that opens the
-notebook in Colab; its first cell installs the wheel.
+notebook in Colab, and the first cell of the notebook installs the package from there.
 """
 
 import json
@@ -71,8 +71,11 @@ def with_colab(page: str, address: str | None) -> str:
 
 
 def notebook_text() -> str:
-    """Return the notebook of the tutorial as text."""
-    notebook = make_notebook(TUTORIAL.read_text(encoding="utf-8"))
+    """Return the notebook of the tutorial as text; one of a repository installs it from there."""
+    page = TUTORIAL.read_text(encoding="utf-8")
+    if address := repository():
+        page = page.replace("'.[train]'", f"'dptse-env[train] @ git+{address}'")
+    notebook = make_notebook(page)
     return json.dumps(notebook, indent=1, ensure_ascii=False) + "\n"
 
 

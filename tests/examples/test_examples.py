@@ -49,6 +49,18 @@ def test_programs_that_train(name, library):
     assert 0.0 < rule < untrained
 
 
+def test_the_demo_ends_with_four_bars_and_a_sentence(tmp_path):
+    need("stable_baselines3")
+    short = "--minutes", 0.05, "--test-seeds", "2000:2004", "--output", tmp_path
+    printed = run("examples/demo.py", *short)
+    bars = re.findall(r" (\d+\.\d) +\d+\.\d +\d+\.\d  █+$", printed, re.MULTILINE)
+    errors = [float(error) for error in bars]
+    assert len(errors) == 4
+    assert min(errors) == errors[-1]  # with every segment queried
+    side = "below" if errors[2] <= errors[1] else "above"
+    assert re.search(rf"The learned policy is \d+\.\d % {side} the best rule", printed)
+
+
 def test_a_schedule_of_ones_own():
     printed = run("examples/my_schedule.py")
     errors = dict(re.findall(r"(\S+) +error x 1000: (\S+)", printed))
