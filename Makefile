@@ -35,17 +35,19 @@ reproduce: setup  ## Write the reports of all studies anew, after playing what t
 	$(BIN)/dptse study policies
 	$(BIN)/dptse study suite
 
+CAPPED = --env 'dptse_env:dptse/PrivateHighway-v1 {"estimator": "ekf", "bandwidth": 5, "privacy": "capped"}'
+PACED = --env 'dptse_env:dptse/PrivateHighway-v1 {"estimator": "ekf", "bandwidth": 5}'
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds or one run; results/audit.
 	$(BIN)/dptse audit --force --output results/audit/printed --env dptse_env:dptse/PaperHighway-v0 --target replaced
 	$(BIN)/dptse audit --force --output results/audit/corrected --env 'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected"}' --target replaced
-	$(BIN)/dptse audit --force --output results/audit/capped-weak --env 'dptse_env:dptse/PrivateHighway-v1 {"privacy": "capped"}' --noise-factor 0.709
-	$(BIN)/dptse audit --force --output results/audit/capped --env 'dptse_env:dptse/PrivateHighway-v1 {"privacy": "capped"}'
-	$(BIN)/dptse audit --force --output results/audit/paced-weak --noise-factor 0.709
-	$(BIN)/dptse audit --force --output results/audit/paced
-	$(BIN)/dptse audit --force --output results/audit/paced-replaced --target replaced
+	$(BIN)/dptse audit --force --output results/audit/capped-weak $(CAPPED) --noise-factor 0.709
+	$(BIN)/dptse audit --force --output results/audit/capped $(CAPPED)
+	$(BIN)/dptse audit --force --output results/audit/paced-weak $(PACED) --noise-factor 0.709
+	$(BIN)/dptse audit --force --output results/audit/paced $(PACED)
+	$(BIN)/dptse audit --force --output results/audit/paced-replaced $(PACED) --target replaced
 	$(BIN)/dptse audit --force --output results/audit/printed-one-run --env dptse_env:dptse/PaperHighway-v0 --one-run
-	$(BIN)/dptse audit --force --output results/audit/paced-one-run-weak --one-run --noise-factor 0.5
-	$(BIN)/dptse audit --force --output results/audit/paced-one-run --one-run
+	$(BIN)/dptse audit --force --output results/audit/paced-one-run-weak $(PACED) --one-run --noise-factor 0.5
+	$(BIN)/dptse audit --force --output results/audit/paced-one-run $(PACED) --one-run
 
 test: setup  ## Run the tests, without the slow ones.
 	$(BIN)/python -m pytest -m 'not slow' -n 2 --dist loadfile

@@ -34,6 +34,7 @@ def measure(*, quick: bool = False) -> list[Row]:
     """
     n, steps, rounds = (2, 2, 2) if quick else (1024, 16, 10)
     keywords = {"traffic_seeds": "0:2" if quick else "0:64", "horizon": 600, "random_start": True}
+    keywords["estimator_settings"] = None
     base = f"batch of {n:,}"
     with tempfile.TemporaryDirectory() as folder:
         corridor = resolve("paper-highway", {}).corridor
@@ -60,6 +61,7 @@ def measure(*, quick: bool = False) -> list[Row]:
         if n_cores() > 1:
             batch = make_batch(PAPER, n, threads=None, **keywords)
             work[f"{base}, {n_cores()} threads"] = stepping(batch, steps)
+        keywords |= {"estimator": "ekf", "bandwidth": 5}
         work[f"{base}, PrivateHighway"] = stepping(make_batch(PRIVATE, n, **keywords), steps)
         times = take_turns(work, rounds)
         bases = {f"{name}, loops": name for name in ("one episode", "batch of 64")}

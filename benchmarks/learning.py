@@ -20,10 +20,10 @@ from benchmarks.turns import Row, Work, compare, make_batch, repeating, sample, 
 from dptse_env.sb3 import ReplicaBaseline, RoadPolicy, SB3VecEnv
 
 ROADS = {
-    "short road": SHORT + ' {"bandwidth": 1, "horizon": 120}',
-    "the paper's road": PRIVATE + ' {"bandwidth": 1, "horizon": 300}',
-    "long road": LONG + ' {"bandwidth": 2, "horizon": 400}',
-    "long road, recurrent": LONG + ' {"bandwidth": 2, "horizon": 400, "estimator": "recurrent"}',
+    "short road": SHORT + ' {"estimator": "ekf", "horizon": 120}',
+    "the paper's road": PRIVATE + ' {"estimator": "ekf", "horizon": 300}',
+    "long road": LONG + ' {"estimator": "ekf", "horizon": 400}',
+    "long road, recurrent": LONG + ' {"horizon": 400}',
 }
 REPLICAS = 8
 

@@ -23,7 +23,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     Traffic flows along a motorway of n mainline segments with on- and off-ramps, S segments in all.
     A step is one second, or ``query_every`` seconds with queries in the first. A policy picks a few
     mainline segments; the connected vehicles there are queried, and a private release model answers
-    for them and for the F fixed sensors with noisy numbers. An estimator, by default an extended
+    for them and for the F fixed sensors with noisy numbers. An estimator, a recurrent network or a
     Kalman filter on a macroscopic traffic model, updates its estimate of density and speed on all
     segments. The aim is to keep the error of that estimate small with few queries. Queries never
     change the traffic: an episode replays a record of SUMO, made once for each traffic seed and
@@ -137,7 +137,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `estimator`          | "ekf"           | or `ukf`, `enkf`, `mhe`, `recurrent`, ...           |
     | `backend`            | "compiled"      | or `reference`: textbook filters, an extra          |
     | `parameters`         | "published"     | of the traffic model: a name, a mapping, a file     |
-    | `estimator_settings` | None            | tuning of the estimator; None for what ships        |
+    | `estimator_settings` | "published"     | tuning of the estimator; None for what ships        |
     | `bandwidth`          | 5               | largest cost of the queries of a step               |
     | `query_spans`        | (1,)            | numbers of neighbouring segments of a query         |
     | `bandwidth_unit`     | "segments"      | or `sums`: what a query costs                       |
@@ -164,12 +164,16 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
 
     **Ids**, all in the namespace ``dptse``:
 
-    | id                  | n   | S   | record | release, epsilon | bandwidth | demand, incident |
-    | :--                 | :-- | :-- | :--    | :--              | :--       | :--              |
-    | `PaperHighway-v0`   | 15  | 19  | 700 s  | printed, 1       | 5         | fixed            |
-    | `PrivateHighway-v1` | 15  | 19  | 700 s  | paced, 5         | 5         | random           |
-    | `LongHighway-v0`    | 120 | 128 | 1200 s | paced, 5         | 8         | random           |
-    | `ShortHighway-v0`   | 6   | 8   | 240 s  | printed, 1       | 2         | fixed            |
+    | id                  | n   | S   | record | release, epsilon | estimator | bandwidth | demand |
+    | :--                 | :-- | :-- | :--    | :--              | :--       | :--       | :--    |
+    | `PaperHighway-v0`   | 15  | 19  | 700 s  | printed, 1       | ekf       | 5         | fixed  |
+    | `PrivateHighway-v1` | 15  | 19  | 700 s  | paced, 5         | recurrent | 1         | random |
+    | `LongHighway-v0`    | 120 | 128 | 1200 s | paced, 5         | recurrent | 2         | random |
+    | `ShortHighway-v0`   | 6   | 8   | 240 s  | printed, 1       | recurrent | 1         | fixed  |
+
+    ``PaperHighway-v0`` is the paper's: its filter, parameters and noise; its schedule is
+    ``shift-ahead``. The others are to learn on: they have the best estimator, calibrated
+    parameters, and so few queries that it pays to choose them.
 
     **Rendering**: true density, estimate, queries and error over space and time, as a picture
     (``rgb_array``) or in a window (``human``). It shows true traffic.

@@ -19,7 +19,8 @@ from torch.distributions import Categorical, Independent
 
 import dptse_env
 
-ENV, KEYWORDS = "dptse_env:dptse/ShortHighway-v0", {"bandwidth": 1, "action": "slots"}
+ENV = "dptse_env:dptse/ShortHighway-v0"
+KEYWORDS = {"estimator": "ekf", "parameters": "published", "action": "slots"}
 N_ENVS, ROLLOUT, EPOCHS, MINIBATCH, RATE = 64, 64, 4, 512, 1e-3
 GAMMA, LAMBDA, CLIP, ENTROPY = 0.9, 0.95, 0.2, 0.003  # a query matters for some ten seconds
 HELD_OUT = range(1000, 1008)

@@ -2,8 +2,8 @@ r"""Train a query policy for two minutes, and show what it is worth on other tra
 
 python examples/demo.py
 
-It runs ``dptse train`` and ``dptse evaluate`` on the short road with one query a second and the
-best estimator there is, and draws four bars. The best rule is that on validation traffic. The
+It runs ``dptse train`` and ``dptse evaluate`` on the short road, which has one query a second and
+the best estimator there is, and draws four bars. The best rule is that on validation traffic. The
 folder results/demo has the policy, its learning curve, and the errors as a table and a figure.
 """
 
@@ -16,7 +16,7 @@ from pathlib import Path
 import tyro
 
 COMMAND = Path(sys.executable).with_name("dptse")
-ENV = 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1, "estimator": "recurrent"}'
+ENV = "dptse_env:dptse/ShortHighway-v0"
 ALGORITHM = 'ppo {"gamma": 0.95, "validations": 8}'
 WIDTH = 40
 """Letters of the longest bar."""

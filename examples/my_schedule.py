@@ -29,9 +29,7 @@ class DenseAndOld(Schedule):
 
 def main() -> None:
     """Compare the schedule with others on the same traffic and noise."""
-    env = gym.make_vec(
-        "dptse/ShortHighway-v0", num_envs=len(SEEDS), traffic_seeds=list(SEEDS), bandwidth=1
-    )
+    env = gym.make_vec("dptse/ShortHighway-v0", num_envs=len(SEEDS), traffic_seeds=list(SEEDS))
     for schedule in ("shift-ahead", "round-robin", "oldest-first", "speed-front", DenseAndOld):
         rows = dptse_env.evaluate(env, schedule, SEEDS)
         errors = [-1000 * row["reward"] for row in rows]

@@ -23,7 +23,8 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
 import dptse_env
 
-ENV, KEYWORDS = "dptse_env:dptse/ShortHighway-v0", {"bandwidth": 1, "action": "slots"}
+ENV = "dptse_env:dptse/ShortHighway-v0"
+KEYWORDS = {"estimator": "ekf", "parameters": "published", "action": "slots"}
 N_ENVS, BATCH = 64, 4096
 HELD_OUT = range(1000, 1008)
 

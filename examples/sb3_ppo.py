@@ -21,7 +21,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 import dptse_env
 from dptse_env.sb3 import ReplicaBaseline, SB3VecEnv, load_policy, save_policy
 
-ENV, KEYWORDS = "dptse_env:dptse/ShortHighway-v0", {"bandwidth": 1, "action": "slots"}
+ENV = "dptse_env:dptse/ShortHighway-v0"
+KEYWORDS = {"estimator": "ekf", "parameters": "published", "action": "slots"}
 FILE, HELD_OUT = Path("results/examples/sb3_ppo.safetensors"), list(range(1000, 1008))
 
 

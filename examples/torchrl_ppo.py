@@ -24,7 +24,8 @@ from torchrl.objectives.value import GAE
 
 import dptse_env
 
-ENV, KEYWORDS = "dptse_env:dptse/ShortHighway-v0", {"bandwidth": 1, "action": "slots"}
+ENV = "dptse_env:dptse/ShortHighway-v0"
+KEYWORDS = {"estimator": "ekf", "parameters": "published", "action": "slots"}
 N_ENVS, BATCH, MINIBATCH = 64, 4096, 512
 HELD_OUT = range(1000, 1008)
 

@@ -307,7 +307,7 @@ class Policy(Import, Replacing):
     r"""Turn a model of stable-baselines3 or sb3-contrib into a saved policy.
 
     dptse import policy model.zip --vecnormalize vecnormalize.pkl \
-        --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}' --output mine --trust
+        --env dptse_env:dptse/ShortHighway-v0 --output mine --trust
 
     Reading a model unpickles it, which can run any code: --trust is your word that you know where
     it is from. The file that it becomes, policy.safetensors, holds numbers alone.

@@ -1,6 +1,6 @@
 r"""Train a query policy in a folder, and go on there after an interruption.
 
-dptse train --env 'dptse_env:dptse/ShortHighway-v0 {"bandwidth": 1}' \
+dptse train --env dptse_env:dptse/ShortHighway-v0 \
     --steps 40000 --train-seeds 0:8 --validation-seeds 1000:1004
 
 It writes best.safetensors and policy.safetensors (the policy best in validation, and the last),

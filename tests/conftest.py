@@ -21,6 +21,8 @@ for name in [*os.environ]:
         del os.environ[name]
 os.environ["OMP_NUM_THREADS"] = "1"
 
+from tests import helpers  # noqa: E402, F401 (an id and a preset of the tests)
+
 # Time limits would depend on the machine, and the first example of a compiled test compiles it.
 TIMELESS = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("same", **TIMELESS, derandomize=True)

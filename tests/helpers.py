@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from dptse_env.config import resolve
+from dptse_env.config import PRESETS, EnvConfig, resolve
 from dptse_env.model import Channels
 from dptse_env.parts import make_interface
 from dptse_env.release import ReleaseModel
@@ -23,8 +23,24 @@ from dptse_env.road import Road, make_road
 from dptse_env.traffic import SHORT_HIGHWAY, Conditions, Corridor, Demand, Geometry, Record, Scales
 from dptse_env.utils.kernels import kernel
 
-SHORT = "dptse_env:dptse/ShortHighway-v0"
-"""Id of the smallest environment: six segments, two queries, records of 240 s."""
+SHORT = "tests.helpers:tests/ShortHighway-v0"
+"""Id of the smallest environment: six segments, two queries, records of 240 s.
+
+It has the EKF with the published parameters, whatever the id of the package has.
+"""
+
+PRIVATE = "tests.helpers:tests/PrivateHighway-v1"
+"""Id of the road with a guarantee, likewise with the EKF and five queries."""
+
+PRESETS["short-plain"] = EnvConfig(corridor="short-highway", bandwidth=2)
+PRESETS["private-plain"] = resolve("private-highway", {"estimator": "ekf", "bandwidth": 5})
+for env_id, preset in ((SHORT, "short-plain"), (PRIVATE, "private-plain")):
+    gym.register(
+        env_id.rpartition(":")[2],
+        entry_point="dptse_env.env:SensorQueryEnv",
+        vector_entry_point="dptse_env.vector_env:SensorQueryVectorEnv",
+        kwargs={"preset": preset},
+    )
 
 # --- cases: a few for every run, the rest among the slow ones -------------------------------------
 
@@ -398,7 +414,7 @@ ABOUT = {
 """Training as the card of a saved policy tells of it."""
 
 
-def untrained(action="slots", preset="short-highway", net_arch=None, seed=0, **keywords):
+def untrained(action="slots", preset="short-plain", net_arch=None, seed=0, **keywords):
     """An untrained policy of the class that goes with an action encoding, and its configuration."""
     import torch
     from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy

@@ -51,6 +51,13 @@ ROADS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Environments whose estimators take steps from recorded states."""
 
+PLAIN: dict[str, dict[str, Any]] = {
+    "PaperHighway-v0": {"estimator_settings": None},
+    "PrivateHighway-v1": {"estimator": "ekf", "bandwidth": 5},
+    "LongHighway-v0": {"estimator": "ekf", "bandwidth": 8},
+}
+"""Keywords of all parts but those of the ids, which are then those of the ids as they were."""
+
 IDS = ("PaperHighway-v0", "PrivateHighway-v1", "ShortHighway-v0", "LongHighway-v0")
 SCHEDULES = (
     "static", "shift-ahead", "round-robin", "random", "oldest-first", "largest-variance",
@@ -93,7 +100,7 @@ def _make(name: str, **keywords: Any) -> Any:
         keywords["corridor"] = _uneven_road()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return gym.make(ID.format(name), disable_env_checker=True, **keywords)
+        return gym.make(ID.format(name), disable_env_checker=True, **{**PLAIN[name], **keywords})
 
 
 class _Witness:
@@ -171,7 +178,7 @@ def _projected(rows: list[FloatArray]) -> FloatArray:
 
 def observations(name: str) -> Numbers:
     """Return what an id gives over `SECONDS` with the paper's schedule."""
-    env = _make(name)
+    env = gym.make(ID.format(name), disable_env_checker=True)
     schedule = make_schedule("shift-ahead", env)
     observation, info = env.reset(seed=11)
     rows, rewards, spent, state = [observation], [], [info["spent_mu"]], None
@@ -241,9 +248,8 @@ def mean_errors(name: str, estimator: str) -> Numbers:
     """Return the errors of density and speed over `SEEDS` with the paper's schedule."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        env = gym.make_vec(
-            ID.format(name), num_envs=len(SEEDS), estimator=estimator, traffic_seeds=list(SEEDS)
-        )
+        keywords = {**PLAIN[name], "estimator": estimator, "traffic_seeds": list(SEEDS)}
+        env = gym.make_vec(ID.format(name), num_envs=len(SEEDS), **keywords)
     rows = evaluate(env, "shift-ahead", list(SEEDS))
     errors = [[row["rmse_density"], row["rmse_speed"]] for row in rows]
     return {"errors": np.array(errors).mean(axis=0)}

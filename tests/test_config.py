@@ -71,7 +71,7 @@ def test_a_whole_configuration_survives_json_and_a_spec(keywords):
     plain["corridor"] = config.corridor.fields()
     if keywords.get("privacy") == SUMS:
         plain["privacy"]["preset"] = SUMS
-    assert resolve("short-highway", json.loads(json.dumps(plain))) == config
+    assert resolve("short-plain", json.loads(json.dumps(plain))) == config
     env = gym.make(SHORT, **keywords)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config == env.unwrapped.config
@@ -123,17 +123,31 @@ def test_tuned_settings_are_found_by_estimator_parameters_privacy_and_road():
         ("ekf", "open_loop"), ("published", "w99-3lane"), ("printed", "corrected")
     ):
         keywords = {"estimator": estimator, "parameters": parameters, "privacy": privacy}
-        settings = resolve("paper-highway", keywords).settings()
+        settings = resolve("paper-highway", {**keywords, "estimator_settings": None}).settings()
         name = f"{estimator}-{parameters}-{privacy}"
         known = name in available_settings()
         assert settings == (load_settings(name) if known else EstimatorSettings())
     assert "ekf-w99-3lane-printed" in available_settings()
-    long = resolve("long-highway", {})
+    long = resolve("long-highway", {"estimator": "ekf"})
     assert long.settings_name == "ekf-w99-3lane-paced-long-highway"
     with pytest.warns(UserWarning, match="tuned on another road"):
         other = resolve("long-highway", {"estimator": "mhe"})
     assert other.settings_name == "mhe-w99-3lane-paced"
-    assert resolve("private-highway", {}).settings_name == "ekf-w99-3lane-paced"
+    assert resolve("private-highway", {"estimator": "ekf"}).settings_name == "ekf-w99-3lane-paced"
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "ukf", "enkf", "mhe", "recurrent", "blend"])
+def test_the_papers_road_has_the_papers_filters_where_all_else_is_the_papers(estimator):
+    for privacy in ("printed", "corrected", "capped", "paced"):
+        keywords = {"estimator": estimator, "privacy": privacy}
+        name = resolve("paper-highway", keywords).settings_name
+        has_filter = estimator not in ("recurrent", "blend")
+        assert str(name).endswith("-published") == has_filter
+        for other in ({"parameters": "w99-3lane"}, {"corridor": {"lanes": 4}}):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                found = resolve("paper-highway", {**keywords, **other})
+            assert found.estimator_settings is None
 
 
 TUNED = {"ekf", "ukf", "enkf", "mhe", "random_walk", "blend"}
@@ -144,6 +158,7 @@ def test_every_shipped_combination_has_tuned_settings_or_says_that_it_has_none()
         CORRIDORS, available_parameters(), RELEASE_MODELS, ESTIMATORS
     ):
         keywords = {"parameters": parameters, "privacy": privacy, "estimator": estimator}
+        keywords["estimator_settings"] = None
         name = f"{estimator}-{parameters}-{privacy}"
         ways = (f"{name}-{road}",) if road == "long-highway" else (name,)
         is_tuned = estimator not in TUNED or any(way in available_settings() for way in ways)
@@ -315,17 +330,17 @@ BAD_QUERIES = [
 def test_bad_queries_are_named():
     for keywords, message in BAD_QUERIES:
         with pytest.raises(ValueError, match=f"^{message}"):
-            resolve("short-highway", {"privacy": SumRelease, **keywords})
+            resolve("short-plain", {"privacy": SumRelease, **keywords})
 
 
 def test_models_of_single_segments_take_what_says_so():
-    assert resolve("short-highway", {"privacy": "capped", "query_spans": [1]}).queries.are_segments
+    assert resolve("short-plain", {"privacy": "capped", "query_spans": [1]}).queries.are_segments
 
 
 @pytest.mark.parametrize("name", ["base", "inherited", "origins"])
 def test_what_a_configuration_keeps_beside_its_keywords_is_no_keyword(name):
     with pytest.raises(UnknownKeywordError, match=rf"^{name} is unknown; allowed: corridor, "):
-        resolve("short-highway", {name: ()})
+        resolve("short-plain", {name: ()})
 
 
 def test_the_hint_on_an_unknown_keyword_imports_no_plugin(monkeypatch):

@@ -220,7 +220,7 @@ BAD = {
 def test_bad_keywords_name_themselves():
     for message, keywords in BAD.items():
         with pytest.raises(ValueError, match=f"^{message}"):
-            SensorQueryEnv(**{"preset": "short-highway", **keywords})
+            SensorQueryEnv(**{"preset": "short-plain", **keywords})
 
 
 def test_values_that_are_nested_deeply_are_refused_by_their_path():

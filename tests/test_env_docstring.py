@@ -15,7 +15,7 @@ from dptse_env.env import SensorQueryEnv
 from dptse_env.registration import ENVIRONMENTS
 from dptse_env.spaces.actions import ACTION_ENCODINGS
 from dptse_env.spaces.observations import BLOCKS
-from tests.helpers import SHORT
+from tests.helpers import ROOT, SHORT
 
 PAPER = "dptse_env:dptse/PaperHighway-v0"
 
@@ -88,7 +88,7 @@ def test_its_arguments_are_all_there_are_and_give_the_defaults():
 def test_its_ids_are_those_that_are_registered():
     rows = table("id")
     assert {f"dptse/{row[0]}" for row in rows} == {*ENVIRONMENTS}
-    for name, n, segments, record, release, bandwidth, traffic in rows:
+    for name, n, segments, record, release, estimator, bandwidth, traffic in rows:
         config = PRESETS[ENVIRONMENTS[f"dptse/{name}"]]
         road, privacy = config.corridor, config.privacy
         found = (
@@ -98,7 +98,26 @@ def test_its_ids_are_those_that_are_registered():
             config.bandwidth,
         )
         assert found == (int(n), int(segments), int(record.removesuffix(" s")), int(bandwidth))
+        assert config.estimator == estimator
         assert release == f"{privacy.preset}, {privacy.epsilon:g}"
         assert traffic == (
             "random" if type(road.conditions.demand).__name__.endswith("Distribution") else "fixed"
         )
+
+
+def test_the_page_of_keywords_has_the_defaults_of_every_id():
+    page = (ROOT / "docs" / "reference" / "configuration.md").read_text(encoding="utf-8")
+    section = page.partition("\n## Ids\n")[2].partition("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("| ")]
+    (_, *ids), _, *rows = [[e.strip(" `") for e in line.strip("|").split("|")] for line in lines]
+    assert {f"dptse/{name}" for name in ids} == {*ENVIRONMENTS}
+    for name, *shown in zip(ids, *(row[1:] for row in rows), strict=True):
+        config = PRESETS[ENVIRONMENTS[f"dptse/{name}"]]
+        road, privacy = config.corridor, config.privacy
+        is_drawn = type(road.conditions.demand).__name__.endswith("Distribution")
+        expected = (
+            config.estimator, config.estimator_settings, config.parameters.name, config.bandwidth,
+            privacy.preset, f"{privacy.epsilon:g}", f"{privacy.delta:g}",
+            road.geometry.n_mainline, road.conditions.duration, "drawn" if is_drawn else "fixed",
+        )  # fmt: skip
+        assert shown == [str(each) for each in expected]

@@ -34,7 +34,8 @@ def make_private(preset="capped", **keywords):
         preset: One of `IDS`.
         keywords: Of the environment; ``privacy`` may name a release model of another class.
     """
-    keywords = {"horizon": STEPS, "random_start": True, **keywords}
+    plain = {"estimator": "ekf", "bandwidth": 5, "horizon": STEPS, "random_start": True}
+    keywords = {**plain, **keywords}
     privacy = {"preset": preset, "boundary_inputs": "nominal"}
     keywords["privacy"] = privacy | keywords.get("privacy", {})
     return gym.make(f"dptse_env:dptse/{IDS[preset]}", traffic_seeds=SEEDS, **keywords)

@@ -18,9 +18,9 @@ from dptse_env.model.parameters import write_parameters
 from dptse_env.release import RELEASE_MODELS
 from dptse_env.traffic import write_corridor
 from tests.estimators.helpers import weights_settings
-from tests.helpers import UNEVEN, fast_and_slow, play
+from tests.helpers import PRIVATE, UNEVEN, fast_and_slow, play
 
-ID = "dptse_env:dptse/PrivateHighway-v1"
+ID = PRIVATE
 ROAD = UNEVEN.replaced(duration=120)
 FAST = [
     {"estimator": "enkf", "privacy": "capped"},
@@ -150,7 +150,7 @@ def test_a_stream_beyond_the_card_of_weights_is_told_once(name, keywords, value,
     settings = weights_settings(tmp_path, **{**KNOWN, "flows": [int(name == "flows"), 1]})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        road = resolve("private-highway", {k: v for k, v in keywords.items() if k != "privacy"})
+        road = resolve("private-plain", {k: v for k, v in keywords.items() if k != "privacy"})
     make = partial(RoadEstimator, road.corridor, "recurrent", estimator_settings=settings)
     _, (said,) = told_beyond(make)
     assert f"{name} " in said

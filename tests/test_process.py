@@ -17,7 +17,7 @@ SEEDS = (11, 12, 13)
 ALL = np.arange(3)
 
 
-def make(n_episodes, preset="short-highway", **keywords):
+def make(n_episodes, preset="short-plain", **keywords):
     keywords = {"traffic_seeds": "0:3", "horizon": 60, "random_start": True, **keywords}
     return QueryProcess(resolve(preset, keywords), n_episodes)
 

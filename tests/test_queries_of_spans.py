@@ -56,7 +56,7 @@ def test_batches_are_episodes_whose_queries_stay_within_the_bandwidth(name, acti
 
 def make_process(**keywords):
     defaults = {"privacy": PricedRelease, "traffic_seeds": "0:1", "horizon": 30, "bandwidth": 6}
-    process = QueryProcess(resolve("short-highway", {**defaults, **keywords}))
+    process = QueryProcess(resolve("short-plain", {**defaults, **keywords}))
     process.reset(ONE, [np.random.default_rng(4)], {"traffic_seed": 0})
     return process
 

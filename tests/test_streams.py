@@ -18,7 +18,7 @@ EVERYWHERE = {"traffic_seed": 0, "start": 0}
 def begin(seeds, options, **keywords):
     """Return a process with two episodes."""
     every = {"bandwidth": 6, "traffic_seeds": "0:2", "horizon": 80, "random_start": True}
-    process = QueryProcess(resolve("short-highway", {**every, **keywords}), 2)
+    process = QueryProcess(resolve("short-plain", {**every, **keywords}), 2)
     process.reset(TWO, [np.random.default_rng(seed) for seed in seeds], options)
     return process
 

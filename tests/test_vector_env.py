@@ -185,7 +185,7 @@ def test_it_draws_the_chosen_episode_as_the_scalar_environment_does():
 )
 def test_bad_keywords_name_themselves(keywords, message):
     with pytest.raises(ValueError, match=f"^{message}"):
-        SensorQueryVectorEnv(**{"num_envs": 2, "preset": "short-highway", **keywords})
+        SensorQueryVectorEnv(**{"num_envs": 2, "preset": "short-plain", **keywords})
 
 
 BAD_RESETS = [

@@ -83,9 +83,9 @@ def played_by(weights: Path) -> dict[str, Any]:
 
 VALIDATION: dict[Kind, tuple[str, ...]] = {
     "flows": (
-        PRIVATE,
-        f'{PRIVATE} {{"privacy": "capped"}}',
-        'dptse_env:dptse/LongHighway-v0 {"horizon": 600}',
+        f'{PRIVATE} {{"bandwidth": 5}}',
+        f'{PRIVATE} {{"bandwidth": 5, "privacy": "capped"}}',
+        'dptse_env:dptse/LongHighway-v0 {"bandwidth": 8, "horizon": 600}',
     ),
     "speeds": (
         "dptse_env:dptse/PaperHighway-v0",

@@ -72,8 +72,8 @@ def _other_road(n_mainline: int, lanes: int, flows: Any, at_ramps: Any, **fields
 
 ROADS = (
     PRIVATE,
-    "dptse_env:dptse/PaperHighway-v0",
-    'dptse_env:dptse/ShortHighway-v0 {"corridor": {"duration": 600}}',
+    'dptse_env:dptse/PaperHighway-v0 {"estimator_settings": null}',
+    'dptse_env:dptse/ShortHighway-v0 {"corridor": {"duration": 600}, "parameters": "published"}',
     "dptse_env:dptse/LongHighway-v0",
     _road(
         demand={

@@ -68,29 +68,36 @@ World = tuple[str, dict[str, Any]]
 """An environment and its keywords."""
 _CALIBRATED = {"parameters": "w99-3lane"}
 """Those of PrivateHighway-v1, so that every filter is calibrated."""
+
+
+def _private(**changes: Any) -> World:
+    """Return the road with a guarantee, by default with five queries a second."""
+    return PRIVATE, {"bandwidth": 5, **changes}
+
+
 _SUMS = {"query_spans": [2], "bandwidth_unit": "sums"}
 WORLDS: dict[str, World] = {
     "PaperHighway-v0": (PAPER, _CALIBRATED),
     "PaperHighway-v0, corrected": (PAPER, {**_CALIBRATED, "privacy": "corrected"}),
-    "PrivateHighway-v1, capped": (PRIVATE, {"privacy": "capped"}),
-    "PrivateHighway-v1": (PRIVATE, {}),
-    "PrivateHighway-v1, five sums": (PRIVATE, _SUMS),
-    "PrivateHighway-v1, ε = 1": (PRIVATE, {"epsilon": 1.0}),
-    "PrivateHighway-v1, ε = 1, five sums": (PRIVATE, {"epsilon": 1.0, **_SUMS}),
+    "PrivateHighway-v1, capped": _private(privacy="capped"),
+    "PrivateHighway-v1": _private(),
+    "PrivateHighway-v1, five sums": _private(**_SUMS),
+    "PrivateHighway-v1, ε = 1": _private(epsilon=1.0),
+    "PrivateHighway-v1, ε = 1, five sums": _private(epsilon=1.0, **_SUMS),
 }
 MAIN = tuple(WORLDS)[:4]
 """Worlds of the figure."""
 _INCIDENT = {"segment": 10, "phases": [[200.0, 400.0, 10.08], [400.0, 500.0, 50.95]]}
 ELSEWHERE: dict[str, World] = {
-    "no incident": (PRIVATE, {"incident": "none"}),
-    "the paper's incident": (PRIVATE, {"incident": _INCIDENT}),
-    "demand with two peaks": (PRIVATE, {"demand": OTHER_DRIVERS["demand"]}),
-    "ShortHighway-v0": (SHORT, _CALIBRATED),
-    **{f"ε = {epsilon:g}": (PRIVATE, {"epsilon": epsilon}) for epsilon in (0.5, 2.0, 10.0, 20.0)},
-    **{f"B = {bandwidth}": (PRIVATE, {"bandwidth": bandwidth}) for bandwidth in (1, 2, 10, 15)},
+    "no incident": _private(incident="none"),
+    "the paper's incident": _private(incident=_INCIDENT),
+    "demand with two peaks": _private(demand=OTHER_DRIVERS["demand"]),
+    "ShortHighway-v0": (SHORT, {**_CALIBRATED, "bandwidth": 2}),
+    **{f"ε = {epsilon:g}": _private(epsilon=epsilon) for epsilon in (0.5, 2.0, 10.0, 20.0)},
+    **{f"B = {bandwidth}": _private(bandwidth=bandwidth) for bandwidth in (1, 2, 10, 15)},
 }
-"""Worlds that differ from PrivateHighway-v1 in one thing, and ShortHighway-v0; other roads and
-drivers are in the study of roads."""
+"""Worlds that differ from PrivateHighway-v1 with five queries a second in one thing, and
+ShortHighway-v0 with two; other roads and drivers are in the study of roads."""
 ALL_WORLDS = {**WORLDS, **ELSEWHERE}
 MOVED = (EKF, WALK, SMOOTHING, LEARNED)
 MOVED_SEEDS = SEEDS[:24]

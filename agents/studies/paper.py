@@ -125,11 +125,12 @@ def once(many: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def keywords_of(labels: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keywords of a cell, which are its labels but for the paper's own settings."""
+    """Return the keywords of a cell: its labels, and which settings its estimator has."""
     name = labels["estimator"]
-    if name not in AS_PUBLISHED:
-        return dict(labels)
-    return {**labels, "estimator": AS_PUBLISHED[name], "estimator_settings": "published"}
+    settings = "published" if name in AS_PUBLISHED else None
+    return {
+        **labels, "estimator": AS_PUBLISHED.get(name, name), "estimator_settings": settings,
+    }  # fmt: skip
 
 
 PAIRS = [(name, setting) for setting in SETTINGS for name in ESTIMATORS]
@@ -169,7 +170,8 @@ def measure_run_time(place: Place) -> pl.DataFrame:
     timed = []
     for labels in once(labels_of(*pair) for pair in PAIRS):
         with quietly():
-            env = gym.make(PAPER, **labels, traffic_seeds=list(SEEDS), records=place.records)
+            keywords = {**keywords_of(labels), "traffic_seeds": list(SEEDS)}
+            env = gym.make(PAPER, **keywords, records=place.records)
         evaluate(env, SCHEDULE, SEEDS[:1])  # kernels load before anything counts
         process = env.get_wrapper_attr("process")
         seconds = time_methods(process.estimator, ("predict", "update", "estimate"))
@@ -189,7 +191,8 @@ def measure_space_time(place: Place) -> pl.DataFrame:
     record(CELLS[0].config.corridor, SEEDS[:1], place.records)
     rows = []
     for labels in once(labels_of(*pair, bandwidth=MAP_SEGMENTS) for pair in PAIRS):
-        watched = watch(SCHEDULE, Cell(PAPER, SCHEDULE, labels), SEEDS[0], place.records)
+        cell = Cell(PAPER, SCHEDULE, keywords_of(labels))
+        watched = watch(SCHEDULE, cell, SEEDS[0], place.records)
         row = {"version": code_version(), **labels}
         row |= {name: watched.row[name] for name in ("traffic_seed", DENSITY)}
         for name in ("truth", "estimate"):

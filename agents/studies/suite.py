@@ -64,7 +64,8 @@ FIGURE = "scores.png"
 SEEDS, LONG_SEEDS = parse_seeds("2500:2532"), parse_seeds("2500:2508")
 """Test traffic of no other study: of roads of up to 15 segments, and of the long road."""
 
-_EKF: Mapping[str, Any] = {"estimator": "ekf"}
+_EKF: Mapping[str, Any] = {"estimator": "ekf", "estimator_settings": None}
+_PUBLISHED: Mapping[str, Any] = {"parameters": "published"}
 # Weights by their name are part of what a cell is, so that rows of other weights are others.
 _RECURRENT: Mapping[str, Any] = {
     "estimator": "recurrent",
@@ -105,7 +106,7 @@ def _cell(
 
 
 CELLS = {
-    "short": _cell(SHORT, 1, _EKF),
+    "short": _cell(SHORT, 1, _EKF, _PUBLISHED),
     "short-paced": _cell(SHORT, 1, _RECURRENT, _SHORT_PACED),
     "printed": _cell(PAPER, 5, _EKF),
     "capped": _cell(PRIVATE, 5, _EKF, {"privacy": "capped"}),

@@ -37,6 +37,7 @@ from dptse_env.utils.arrays import Observation
 
 ROOT = Path(__file__).parents[2]
 ENV = "dptse_env:dptse/PrivateHighway-v1"
+KEYWORDS = {"estimator": "ekf", "bandwidth": 5}
 TRAFFIC = 2001  # its incident falls into the seconds that are shown
 BLUE, ORANGE = COLOURS[:2]
 SCHEDULES = (
@@ -128,7 +129,7 @@ def draw_queries() -> Figure:
     figure = make_figure(7.0, 5.2, dpi=160)
     axes = figure.subplots(3, 2, sharex=True, sharey=True)
     for axis, name in zip(axes.flat, SCHEDULES, strict=True):
-        watched = watch(name, Cell(ENV, name, {}, {}), TRAFFIC)
+        watched = watch(name, Cell(ENV, name, KEYWORDS), TRAFFIC)
         truth = np.array(watched.history.truth)[SHOWN].T
         n, seconds = truth.shape
         image = axis.imshow(
@@ -153,7 +154,7 @@ def draw_queries() -> Figure:
 
 def played(seconds: int) -> Iterator[tuple[SensorQueryEnv, Observation, float, dict[str, float]]]:
     """Yield the environment, observation, reward and info of every second of a round robin."""
-    env = SensorQueryEnv("private-highway", traffic_seeds=[TRAFFIC])
+    env = SensorQueryEnv("private-highway", traffic_seeds=[TRAFFIC], **KEYWORDS)
     schedule, state = make_schedule("round-robin", env), None
     observation, _ = env.reset(seed=0)
     for _ in range(seconds):

@@ -145,7 +145,8 @@ def draw_road(corridor: Corridor) -> Figure:
 
 def draw_frame(path: Path, seconds: int = 420) -> None:
     """Save what an environment renders when some seconds of an episode are over."""
-    env = gym.make("dptse_env:dptse/PrivateHighway-v1", render_mode="rgb_array")
+    keywords = {"estimator": "ekf", "bandwidth": 5, "render_mode": "rgb_array"}
+    env = gym.make("dptse_env:dptse/PrivateHighway-v1", **keywords)
     schedule, state = make_schedule("speed-front", env), None
     observation, _ = env.reset(seed=0, options={"traffic_seed": 0})
     for _ in range(seconds):

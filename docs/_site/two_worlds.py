@@ -133,7 +133,7 @@ def say(axis: Axes, at: tuple[float, float], text: str, colour: str) -> None:
 
 def main() -> None:
     """Draw the picture."""
-    config = make_config("dptse_env:dptse/PrivateHighway-v1", {})
+    config = make_config("dptse_env:dptse/PrivateHighway-v1", {"estimator": "ekf", "bandwidth": 5})
     record = RecordLibrary().get(config.corridor, 0)
     trips = tuple(Trajectory.from_record(record, vehicle) for vehicle in VEHICLES)
     rest = record.without(VEHICLES[1]).without(VEHICLES[0])

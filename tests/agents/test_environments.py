@@ -16,7 +16,7 @@ def headed(text):
 def test_a_heading_names_what_is_in_force():
     assert headed(PRIVATE) == (
         "PrivateHighway-v1, parameters w99-3lane, release model paced (epsilon 5, delta 0.05), "
-        "penetration 1, bandwidth 5, query_every 1, fixed sensors 14, 17, 18, no loops"
+        "penetration 1, bandwidth 1, query_every 1, fixed sensors 14, 17, 18, no loops"
     )
 
 
@@ -63,12 +63,15 @@ def test_a_heading_names_each_condition(keywords, named):
 @pytest.mark.parametrize(
     ("keywords", "settings"),
     [
-        ({}, "ekf-w99-3lane-paced"),
+        ({"estimator": "ekf"}, "ekf-w99-3lane-paced"),
         ({"estimator": "recurrent"}, "weights highway-flows"),
         ({"estimator": "recurrent", "privacy": "corrected"}, "weights highway-speeds"),
         ({"estimator": "asm"}, "defaults"),
-        ({"estimator_settings": "published"}, "ekf-w99-3lane-paced-published"),
-        ({"estimator_settings": {"noise_scale": [2.0, 2.0]}}, "its own"),
+        (
+            {"estimator": "ekf", "estimator_settings": "published"},
+            "ekf-w99-3lane-paced-published",
+        ),
+        ({"estimator": "ekf", "estimator_settings": {"noise_scale": [2.0, 2.0]}}, "its own"),
     ],
 )
 def test_settings_in_force_have_a_name(keywords, settings):

@@ -32,7 +32,7 @@ def make(kind, preset="capped", n_episodes=1):
     """A boundary of the short road, and its model; `corrected` releases mean speeds."""
     privacy = {"preset": preset, "boundary_inputs": kind}
     keywords = {"privacy": privacy, "traffic_seeds": "0:2", "parameters": "w99-3lane"}
-    config = resolve("short-highway", keywords)
+    config = resolve("short-plain", keywords)
     release, model = make_release(config, n_episodes), make_model(config)
     boundary = BOUNDARIES[kind](release.task, release.traffic, model)
     release.traffic.load([0, 1])
@@ -131,7 +131,7 @@ def test_whatever_noise_makes_of_a_release_gives_inputs_that_a_road_can_have(pre
 def test_boundary_segments_are_released_at_every_step_and_drive_the_next():
     privacy = {"preset": "capped", "boundary_inputs": "private"}
     keywords = {"traffic_seeds": "0:2", "horizon": 100, "random_start": True, "privacy": privacy}
-    process = QueryProcess(resolve("short-highway", keywords))
+    process = QueryProcess(resolve("short-plain", keywords))
     process.reset(ONE, [np.random.default_rng(3)], {"traffic_seed": 1, "start": 100})
     released, inputs = [], []
     release, predict = process.release.release, process.estimator.predict

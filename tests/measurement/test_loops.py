@@ -37,7 +37,7 @@ def test_readings_tell_the_estimator_of_the_traffic():
 def test_processes_that_share_loaded_traffic_read_the_same():
     """Loops, and the boundary of this id, which is that of the true traffic."""
     given = {"traffic_seeds": [0], "horizon": 60, "loops": {"positions": [0.3], "interval": 20}}
-    first = QueryProcess(resolve("short-highway", given))
+    first = QueryProcess(resolve("short-plain", given))
     second = QueryProcess(first.config, traffic=first.traffic)
     first.traffic.load([0])
     for process in (first, second):

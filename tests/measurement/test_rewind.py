@@ -25,7 +25,7 @@ STARTS = {"traffic_seed": [0, 1, 2, 1], "start": [0, 13, 39, 41]}
 
 def begun(**keywords):
     given = {"traffic_seeds": "0:3", "horizon": 60, "random_start": True, "loops": LOOPS}
-    process = QueryProcess(resolve("short-highway", {**given, **keywords}), 4)
+    process = QueryProcess(resolve("short-plain", {**given, **keywords}), 4)
     process.reset(ALL, [np.random.default_rng(seed) for seed in SEEDS], STARTS)
     return process
 

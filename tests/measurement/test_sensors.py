@@ -37,7 +37,7 @@ def begun(preset="paced", seed=3, *, privacy=None, **keywords):
         "privacy": {"preset": preset, **(privacy or {})},
         **keywords,
     }
-    process = QueryProcess(resolve("short-highway", given))
+    process = QueryProcess(resolve("short-plain", given))
     process.reset(ONE, [np.random.default_rng(seed)], {"traffic_seed": 1, "start": 150})
     return process
 
@@ -76,7 +76,7 @@ def true_counts(process, asked, *segments):
 
 
 def test_groups_are_queries_and_sensors_with_their_parts_of_the_budget():
-    road = resolve("short-highway", {}).corridor
+    road = resolve("short-plain", {}).corridor
     bare, some = dataclasses.replace(road, fixed_sensors=()), Penetration(0.25)
 
     def shares(*args, private=False):
@@ -89,7 +89,7 @@ def test_groups_are_queries_and_sensors_with_their_parts_of_the_budget():
     assert shares(some, SensorSettings(), bare) == {"queries": 1.0}
     assert set(shares(some, SensorSettings(), bare, private=True)) == {"queries", "sensors"}
     for all_connected in ({}, {"penetration": 1.0}, {"penetration": {"seed": 4}}):
-        process = QueryProcess(resolve("short-highway", all_connected))
+        process = QueryProcess(resolve("short-plain", all_connected))
         assert process.release.task.groups == (Group("queries"),)
         assert (process.fusion, process.sensor_errors) == (None, None)
         assert "groups" not in process.release.report().to_dict()
@@ -101,8 +101,8 @@ def test_a_model_that_knows_of_no_groups_is_refused_before_anything_is_recorded(
         ({"sensor_settings": {"dropout": 0.1}}, "sensor_settings must be left out"),
     ):
         with pytest.raises(ValueError, match=rf"^{message} with the release model .*SumRelease'"):
-            resolve("short-highway", {"privacy": SumRelease, **keywords})
-    assert make_release(resolve("short-highway", {"privacy": SumRelease})).task.is_whole
+            resolve("short-plain", {"privacy": SumRelease, **keywords})
+    assert make_release(resolve("short-plain", {"privacy": SumRelease})).task.is_whole
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -272,7 +272,7 @@ def test_errors_are_as_large_as_the_deviation_of_the_measurement_says(preset):
 )
 def test_bad_sensors_are_refused_by_path(keywords, message):
     with pytest.raises(ValueError, match=message):
-        resolve("short-highway", keywords)
+        resolve("short-plain", keywords)
 
 
 def test_sensors_without_errors_are_exact():

@@ -13,7 +13,7 @@ from .worlds import task_of
 def task(boundary="nominal", preset=SumRelease, **keywords):
     privacy = {"preset": preset, "boundary_inputs": boundary}
     road = {"fixed_sensors": [5, 7, 2]}
-    return make_task(resolve("short-highway", {"privacy": privacy, "corridor": road, **keywords}))
+    return make_task(resolve("short-plain", {"privacy": privacy, "corridor": road, **keywords}))
 
 
 def test_channels_are_those_of_the_road_and_then_boundary_cells():
@@ -38,7 +38,7 @@ def test_a_channel_is_as_long_as_what_it_covers():
 
 
 def test_a_model_has_the_channels_and_the_centre_of_the_task():
-    config = resolve("short-highway", {"privacy": SumRelease, "query_spans": (1, 2)})
+    config = resolve("short-plain", {"privacy": SumRelease, "query_spans": (1, 2)})
     model, expected, road = make_model(config), make_task(config), config.corridor.geometry
     np.testing.assert_array_equal(model.channels.first, expected.channels.first)
     np.testing.assert_array_equal(model.channels.span, expected.channels.span)

@@ -66,7 +66,7 @@ def test_ramps_stand_where_they_join_and_fixed_sensors_with_them():
 
 
 def test_prices_and_the_spent_share_are_channels_where_they_are_observed():
-    named = [RoadChannels.from_config(resolve("short-highway", {"privacy": privacy})).channels
+    named = [RoadChannels.from_config(resolve("short-plain", {"privacy": privacy})).channels
              for privacy in (SumRelease, PricedRelease)]  # fmt: skip
     without, priced = ({channel.name for channel in channels} for channels in named)
     assert priced - without == {"mainline last_price", "mainline spent_share"}
@@ -76,7 +76,7 @@ def test_prices_and_the_spent_share_are_channels_where_they_are_observed():
 
 
 def make_policy(preset="private-highway", *, skips_sensors=True, **keywords):
-    config = resolve(preset, {"action": "slots", **keywords})
+    config = resolve(preset, {"action": "slots", "bandwidth": 5, **keywords})
     torch.manual_seed(0)
     return RoadPolicy.from_config(config, skips_sensors=skips_sensors)
 
@@ -179,7 +179,7 @@ def test_segments_share_one_scorer():
 
 def test_policies_of_two_environments_share_their_weights():
     policy = make_policy("short-highway")
-    config = resolve("short-highway", {"action": "slots", "bandwidth": 4})
+    config = resolve("short-plain", {"action": "slots", "bandwidth": 4})
     twin = policy.sharing(config)
     with torch.no_grad():
         policy.scorer.rule.weight.add_(1.0)
@@ -187,7 +187,7 @@ def test_policies_of_two_environments_share_their_weights():
     torch.testing.assert_close(twin.scores(seen), policy.scores(seen), rtol=0, atol=0)
     assert twin.bandwidth == 4
     with pytest.raises(ValueError, match=r"one lacks \['mainline released_speed'\]"):
-        policy.sharing(resolve("short-highway", {"action": "slots", "privacy": "capped"}))
+        policy.sharing(resolve("short-plain", {"action": "slots", "privacy": "capped"}))
 
 
 @pytest.mark.parametrize("bandwidth", [1, 3])
@@ -224,7 +224,7 @@ def test_an_update_of_ppo_sees_what_a_rollout_did():
 
 
 def test_spaces_that_do_not_fit_are_refused():
-    config = resolve("short-highway", {"action": "slots"})
+    config = resolve("short-plain", {"action": "slots"})
     interface, road = make_interface(config), RoadChannels.from_config(config)
     seen, taken = interface.observations.space, interface.actions.space
     longer = spaces.Box(0, 1, (road.size + road.n_mainline,))

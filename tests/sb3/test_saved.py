@@ -70,7 +70,7 @@ CLASSES = {
 def make(name):
     """An untrained policy of a class that can be saved, its configuration, and its encoding."""
     action, given = CLASSES[name]
-    config = resolve("short-highway", {"action": action})
+    config = resolve("short-plain", {"action": action})
     interface = make_interface(config)
     if "road" in given:
         given = {**given, "road": RoadChannels.from_config(config)}

@@ -148,9 +148,9 @@ def test_recorded_traffic_has_a_fixed_demand_and_no_incident(recorded):
 
 def test_environments_replay_recordings(recorded):
     road = {"corridor": f"{recorded.recordings.folder}/road.toml"}
-    assert resolve("short-highway", road).traffic_seeds == (0, 1)  # those of training
+    assert resolve("short-plain", road).traffic_seeds == (0, 1)  # those of training
     with pytest.raises(ValueError, match=r"must be one that was recorded .*, got 2\.\.63"):
-        resolve("short-highway", {**road, "traffic_seeds": "0:64"})
+        resolve("short-plain", {**road, "traffic_seeds": "0:64"})
     keywords = {"estimator": "random_walk", "truth_in_info": True, "traffic_seeds": [1000]}
     env = gym.make("dptse_env:dptse/ShortHighway-v0", **road, **keywords)
     env.reset(seed=0)

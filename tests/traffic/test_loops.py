@@ -42,7 +42,7 @@ def test_a_position_within_a_segment_is_moved_to_the_nearest_border_and_this_is_
 )
 def test_what_is_no_station_is_refused_with_path_and_value(loops, message):
     with pytest.raises(ValueError, match=rf"^corridor\.loops\.{message}$"):
-        resolve("short-highway", {"loops": loops})
+        resolve("short-plain", {"loops": loops})
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_what_is_no_station_is_refused_with_path_and_value(loops, message):
 )
 def test_what_does_not_suit_loops_is_refused(keywords, message):
     with pytest.raises(ValueError, match=f"^{message}$"):
-        resolve("short-highway", {"loops": PLACES, **keywords})
+        resolve("short-plain", {"loops": PLACES, **keywords})
 
 
 def test_a_road_file_keeps_loops_and_names_itself_where_they_are_wrong(tmp_path):
@@ -65,14 +65,14 @@ def test_a_road_file_keeps_loops_and_names_itself_where_they_are_wrong(tmp_path)
     write_corridor(path, road)
     assert read_corridor(path) == road
     given = {"corridor": str(path), "loops": {"interval": 60}}
-    assert resolve("short-highway", given).corridor.loops.interval == 60
-    assert resolve("short-highway", {"corridor": str(path), "loops": None}).corridor.loops is None
+    assert resolve("short-plain", given).corridor.loops.interval == 60
+    assert resolve("short-plain", {"corridor": str(path), "loops": None}).corridor.loops is None
     path.write_text(path.read_text().replace("interval = 30", "interval = 700"))
     with pytest.raises(ValueError, match=r"road\.toml: corridor\.loops\.interval must be .* 700"):
         read_corridor(path)
 
 
 def test_keywords_of_loops_survive_json():
-    config = resolve("short-highway", {"loops": PLACES | {"ramps": [2]}})
+    config = resolve("short-plain", {"loops": PLACES | {"ramps": [2]}})
     loops = json.loads(json.dumps(config.corridor.fields()))["loops"]
-    assert resolve("short-highway", {"loops": loops}).corridor == config.corridor
+    assert resolve("short-plain", {"loops": loops}).corridor == config.corridor

@@ -81,7 +81,7 @@ IMPOSSIBLE = [
 def test_shares_are_numbers_pairs_and_mappings_within_their_range():
     for penetration, message in IMPOSSIBLE:
         with pytest.raises(ValueError, match=rf"^penetration\.{message}"):
-            resolve("short-highway", {"penetration": penetration})
+            resolve("short-plain", {"penetration": penetration})
     for value in (0.1, [0.1, 0.2], {"seed": 3}):
-        config = resolve("short-highway", {"penetration": value})
+        config = resolve("short-plain", {"penetration": value})
         assert config.has_separate_sensors == (value != {"seed": 3})

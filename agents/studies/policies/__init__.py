@@ -145,16 +145,17 @@ _ONE, _TWO = ({"estimator": "ekf", "bandwidth": bandwidth} for bandwidth in (1, 
 _PACED: dict[str, Any] = {"privacy": {"preset": "paced", "epsilon": 5.0}}
 _RECURRENT: dict[str, Any] = {"estimator": "recurrent", "bandwidth": 2}
 _CAPPED: dict[str, Any] = {"bandwidth": 5, "privacy": {"preset": "capped", "epsilon": 5.0}}
+_PUBLISHED, _TUNED = {"parameters": "published"}, {"estimator_settings": None}
 SETTINGS = {
-    "short": Setting("ShortHighway-v0, B = 1", SHORT, _ONE),
-    "short-paced": Setting("ShortHighway-v0, paced, B = 1", SHORT, _ONE | _PACED),
+    "short": Setting("ShortHighway-v0, B = 1", SHORT, _ONE | _PUBLISHED),
+    "short-paced": Setting("ShortHighway-v0, paced, B = 1", SHORT, _ONE | _PUBLISHED | _PACED),
     "private-1": Setting("PrivateHighway-v1, B = 1", PRIVATE, _ONE),
     "private-2": Setting("PrivateHighway-v1, B = 2", PRIVATE, _TWO),
     "long": Setting("LongHighway-v0, B = 2", LONG, _TWO, LONG_TRAFFIC, LONG_CHANGES),
     "long-recurrent": Setting(
         "LongHighway-v0, recurrent, B = 2", LONG, _RECURRENT, LONG_TRAFFIC, LONG_CHANGES
     ),
-    "capped": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED),
+    "capped": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED | _TUNED),
 }
 SHIPPED = {
     "short": "short-highway", "short-paced": "short-highway-paced",

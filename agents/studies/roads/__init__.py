@@ -101,21 +101,24 @@ def _own_roads() -> dict[str, dict[str, Any]]:
 _OWN_ROADS = _own_roads()
 KEPT_BACK = [name for name, keywords in _OWN_ROADS.items() if keywords.pop("kept_back", False)]
 """Roads on which nothing was chosen."""
-_CALIBRATED = {"parameters": "w99-3lane"}
+_CALIBRATED, _FIVE = {"parameters": "w99-3lane"}, {"bandwidth": 5}
 OTHERS: dict[str, Road] = {
     **{
         f"sections, {queue}": Road(PRIVATE, [*map(_section, numbers)])
         for queue, numbers in QUEUES.items()
     },
-    "PrivateHighway-v1": Road(PRIVATE, [({}, MORE_SEEDS)]),
+    "PrivateHighway-v1": Road(PRIVATE, [(_FIVE, MORE_SEEDS)]),
     "PaperHighway-v0": Road(PAPER, [(_CALIBRATED, MORE_SEEDS)], ("printed", CORRECTED)),
-    "LongHighway-v0": Road(LONG, [({}, SEEDS)], (PACED,)),
+    "LongHighway-v0": Road(LONG, [({"bandwidth": 8}, SEEDS)], (PACED,)),
 }
 """Beside the own roads: recorded ones, and those that weights are trained on."""
-OWN = {name: Road(PRIVATE, [(keywords, SEEDS)]) for name, keywords in _OWN_ROADS.items()}
+OWN = {name: Road(PRIVATE, [(_FIVE | each, SEEDS)]) for name, each in _OWN_ROADS.items()}
 DRAWN = {
     name: Road(
-        PRIVATE, [(drawn.keywords(name), TEST)], (MUCH_NOISE, PACED, LITTLE_NOISE), ALL_FILTERS
+        PRIVATE,
+        [(_FIVE | drawn.keywords(name), TEST)],
+        (MUCH_NOISE, PACED, LITTLE_NOISE),
+        ALL_FILTERS,
     )
     for name in drawn.NAMES
 }

@@ -45,7 +45,7 @@ def keywords(name: str) -> dict[str, Any]:
 
 def calibrate(name: str) -> ARZParameters:
     """Return the parameters with which an EKF errs least on a road's training traffic."""
-    given = {"corridor": keywords(name)["corridor"]}
+    given = {"corridor": keywords(name)["corridor"], "estimator": "ekf", "bandwidth": 5}
     with quietly():
         corridor = make_config(PRIVATE, given).corridor
     start = start_from(load_parameters(DEFAULT_PARAMETERS), corridor, name.replace("_", "-"))

@@ -29,7 +29,8 @@ def rows():
 def test_own_roads_are_others_and_their_filters_are_calibrated():
     with quietly():
         configs = {
-            name: make_config(road.env, road.parts[0][0]) for name, road in roads.OWN.items()
+            name: make_config(road.env, {**road.parts[0][0], "estimator": "ekf"})
+            for name, road in roads.OWN.items()
         }
     digests = {config.corridor.digest for config in configs.values()}
     assert len(digests) == 14

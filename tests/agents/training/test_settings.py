@@ -79,7 +79,7 @@ PAIRS = {"bandwidth": 2, "query_spans": [1, 2], "privacy": "paced"}
     ],
 )
 def test_algorithms_that_fit_a_space_of_actions(keywords, expected):
-    assert fitting(resolve("short-highway", keywords)) == expected
+    assert fitting(resolve("short-plain", keywords)) == expected
 
 
 def env(**keywords):

@@ -167,7 +167,7 @@ FIT = replace(TUNED, price=0.01, batches=400, batch_size=256, rate=1e-2)
 @pytest.fixture
 def policy():
     torch.manual_seed(0)
-    config = resolve("short-highway", {"action": "slots", "bandwidth": 2})
+    config = resolve("short-plain", {"action": "slots", "bandwidth": 2})
     return RoadPolicy.from_config(config)
 
 

@@ -297,7 +297,7 @@ def test_several_environments_teach_one_network(whole):
     regression, forks = 9 * (4 + 4), 1 + 2 * (1 + 2)
     assert rows[-1]["steps"] == regression + 2 * (3 + 3) * 80 * forks
     for column in ("validation", "validation_drawn"):
-        each = [row for name, row in rows[-1].items() if name.startswith(f"{column} in dptse_env")]
+        each = [row for name, row in rows[-1].items() if name.startswith(f"{column} in ")]
         assert len(each) == 2
         assert rows[-1][column] == pytest.approx(sum(each) / 2)
     policy = load_policy(folder / POLICY, gym.make(SHORT, action="slots", **KEYWORDS))
