@@ -1,5 +1,4 @@
 import json
-import sys
 
 import pytest
 
@@ -8,7 +7,6 @@ from dptse_env.release import ReleaseModel
 from dptse_env.release.gaussian import Printed
 from scripts.audit import Args, main
 from tests.helpers import SHORT
-from tests.scripts.commands import refused
 
 CAPPED = {"preset": "capped", "epsilon": 5.0, "cap": 16}
 
@@ -119,37 +117,3 @@ def test_every_argument_arrives(tmp_path, capsys):
     assert again["result"] == found["result"] != other["result"]
     elsewhere = run(tmp_path / "elsewhere", privacy, seed=5, traffic_seed=0, **arguments)
     assert elsewhere["result"] != found["result"]
-
-
-@pytest.mark.parametrize(
-    ("changes", "path"),
-    [
-        ({"target": "everyone"}, "target"),
-        ({"target": "opposite"}, "target"),
-        ({"trials": 1}, "trials"),
-        ({"env": f'{SHORT} {{"records": "mine"}}'}, r"env\.records"),
-        ({"noise_factor": 0.0}, "noise_factor"),
-        ({"one_run": True, "trials": 5000, "target": "deleted"}, "--target"),
-        ({"one_run": True, "trials": 6000}, "--trials"),
-        ({"privacy": {"preset": "paced", "cap": 9}}, r"privacy\.cap"),
-    ],
-)
-def test_bad_arguments_are_named_and_nothing_is_recorded_or_written(changes, path, tmp_path):
-    with pytest.raises(ValueError, match=rf"^{path} (must be|is unknown)"):
-        run(tmp_path, **{"records": tmp_path / "cache", **changes})
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("words", "status", "said"),
-    [
-        (("--executor", "ray"), 1, "pip install 'dptse-env[ray]'"),
-        (("--address", "auto"), 2, "address must be given with the executor ray, got 'auto'"),
-    ],
-)
-def test_machines_that_are_not_there_are_one_line(words, status, said, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    where = ("--output", tmp_path / "out", "--records", tmp_path / "cache")
-    line = refused("audit", "--env", SHORT, *where, *words, status=status)
-    assert said in line
-    assert list(tmp_path.iterdir()) == []

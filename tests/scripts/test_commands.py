@@ -104,11 +104,6 @@ def test_help_on_a_command_is_that_of_the_command():
     assert run_command("help", "record").stdout == run_command("record", "--help").stdout
     words = "import", "field"
     assert run_command("help", *words).stdout == run_command(*words, "--help").stdout
-    assert "no command" in refused("help", "recrod")
-
-
-def test_an_unknown_command_is_told():
-    assert all(name in refused("recrod") for name in ("recrod", *MODULES))
 
 
 @pytest.mark.parametrize("name", GONE)
@@ -130,22 +125,6 @@ def test_what_has_the_place_of_an_option_is_told(name, old, monkeypatch):
     offered = re.findall(r"--[a-z-]+", pages)
     assert old not in offered
     assert {*re.findall(r"--[a-z-]+", new)} <= {*offered}
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["record", "--sed", "0:1"], "Unrecognized options: --sed, 0:1"),
-        (["record", "--workers", "x"], "Error parsing --workers"),
-        (["record", "--workers"], "Missing value for argument '--workers'"),
-        (["train-estimator", "--kinds", "x"], "Expected one of ('flows', 'speeds')"),
-        (["import"], "Expected one of {trajectories"),
-        (["import", "field", "--lanes", "3"], "Missing from dptse import field: --output PATH"),
-        (["study"], "Missing from dptse study: NAME"),
-    ],
-)
-def test_a_line_that_cannot_be_parsed_is_an_error_in_one_line(words, said):
-    assert said in refused(*words)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
@@ -263,26 +242,6 @@ def test_a_program_of_its_own_ends_with_the_status():
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: train_seeds")
-
-
-ENVIRONMENTS = {
-    "dptse_env:dptse/Nowhere-v0": "env must be",
-    "no_such_module:dptse/PaperHighway-v0": "env must be",
-    "CartPole-v1": "env must be",
-    f"{SHORT} 3": "env must be an id and a JSON object, got '3'",
-    f"{SHORT} {'[' * 100_000}": "env must be JSON: maximum recursion depth",
-    f'{SHORT} {{"epsilon": {"9" * 5000}}}': "env must be JSON: Exceeds the limit",
-    f'{SHORT} {{"cargo": 1}}': "cargo",
-    f'{SHORT} {{"corridor": {{"duration": -3}}}}': "corridor.duration must be",
-}
-
-
-@pytest.mark.parametrize("command", ["record", "evaluate", "audit"])
-def test_what_is_wrong_with_an_environment_is_said_by_its_path(command, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for env, message in ENVIRONMENTS.items():
-        assert refused(command, "--env", env).startswith(f"error: {message}")
-    assert not list(tmp_path.iterdir())
 
 
 def content(pattern):

@@ -27,8 +27,6 @@ from tests.scripts.commands import refused, run_command
 
 WALK = f'{SHORT} {{"estimator": "random_walk"}}'
 
-SURE = f'{SHORT} {{"estimator_settings": {{"process_noise": [0, 0]}}}}'
-
 
 def rows_of(folder, policy=None):
     rows = read_rows("evaluation", folder)
@@ -277,29 +275,3 @@ def test_estimators_and_keywords_reach_the_environment():
     assert own.labels == {"estimator": "ekf", "policy": "round-robin"}
     _, rules = make_cells(Args(env=SHORT))
     assert {cell.policy for cell in rules} == {*OBSERVATION_SCHEDULES}
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--policies", "best"], "schedule must be one of"),
-        (["--reference", "nobody"], "'nobody'"),
-        (["--estimators", "kf"], "estimator must be one of"),
-        (["--seed", "-1"], "seed must be"),
-        # The first could be played.
-        (["--env", SURE, "--estimators", "ekf", "mhe"], "estimator_settings.process_noise[0] must"),
-        (["--test-seeds", "2000:2000"], "test_seeds must be"),
-        (["--policies", "a/b.safetensors", "c/a/b.safetensors"], "'a/b'"),
-        (["--policies", "nobody.safetensors"], "nobody.safetensors"),
-        (["--policies", "nobody"], "'nobody'"),
-        (["--env", f'{SHORT} {{"horizon": 60}}'], "horizon or the road's duration must be above"),
-        (["--env", f'{SHORT} {{"records": "mine"}}'], "env.records must be left out"),
-        (["--env", f'{SHORT} {{"traffic_seeds": "0:2"}}'], "env.traffic_seeds must be left out"),
-        (["--workers", "99999999999999"], "workers must be an integer in 1..10000"),
-        (["--beside", "card.json"], "--beside must be left out without --suite"),
-    ],
-)
-def test_bad_arguments_are_named_and_nothing_is_written(words, message, tmp_path):
-    words = words if "--env" in words else ["--env", SHORT, *words]
-    assert message in refused("evaluate", *words, "--output", tmp_path / "out")
-    assert not (tmp_path / "out").exists()

@@ -97,23 +97,6 @@ def test_a_mapping_describes_the_data(road, tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ((), "format must be given where no mapping is"),
-        (("--format", "xls"), "source.format must be one of"),
-        (("--format", "table", "--columns", "t"), "columns must be key=value, got 't'"),
-        (("--format", "table", "--units", "length=yd"), "source.units.length must be one of"),
-        (("--format", "table", "--shares", "1", "1", "0"), "shares must be at least 0"),
-    ],
-)
-def test_what_is_wrong_with_trajectories_is_said(words, message, road, tmp_path):
-    path = plain(tmp_path / "a.csv", stream(seconds=30.0))
-    common = "--files", path, "--env", on(road), "--output", tmp_path / "new"
-    assert refused("import", "trajectories", *common, *words).startswith(f"error: {message}")
-    assert not (tmp_path / "new").exists()
-
-
 @pytest.fixture(scope="module")
 def fifteen_minutes(tmp_path_factory):
     """A folder with the files of the page on data, and 15 minutes of simulated NGSIM rows."""
@@ -282,21 +265,3 @@ def test_what_is_imported_can_be_played_as_the_last_line_says(tmp_path):
     with pytest.warns(UserWarning, match="values measured or tuned on"):
         made = gym.make(env, **keywords)
     assert made.unwrapped.config.corridor.geometry.n_mainline == 2
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--path", "in"), "error: net must be given, or a configuration"),
-        (("--net", "{town}/road.net.xml"), "error: path must be"),
-        (("--net", "{town}/road.net.xml", "--path", "in ... on out"), "error: path must be"),
-        (("--net", "{town}/road.net.xml", "--path", "on"), "error: path: {town}/road.net.xml"),
-        (
-            ("--net", "{town}/road.net.xml", "--path", "in", "--output", "{town}/…"),
-            "error: output must be a folder whose name",
-        ),
-    ],
-)
-def test_what_is_wrong_with_a_network_is_said(words, message, town):
-    given = [each.format(town=town) for each in ("--output", "{town}/new", *words)]
-    assert refused("import", "network", *given).startswith(message.format(town=town))

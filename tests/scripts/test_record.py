@@ -5,7 +5,7 @@ from pathlib import Path
 
 from dptse_env.traffic import SHORT_HIGHWAY, RecordLibrary, randomised
 from tests.helpers import SHORT
-from tests.scripts.commands import refused, run_command
+from tests.scripts.commands import run_command
 
 
 def test_what_an_environment_replays_is_recorded(tmp_path):
@@ -32,13 +32,3 @@ def test_records_for_programs(tmp_path):
     names = sorted(path.name for path in Path(found["folder"]).glob("0*"))
     assert names == [f"0000{seed}.safetensors" for seed in ("0000", "0001", "2000")]
     assert found["dwell"] > 0.0
-
-
-def test_seeds_are_those_of_their_traffic_and_must_be_given(tmp_path):
-    words = "record", "--env", SHORT, "--records", tmp_path / "cache"
-    for option in ("--train-seeds", "--validation-seeds", "--test-seeds"):
-        assert option in refused(*words)
-        assert option in refused(*words, "--seeds", "0:4")
-    outside = refused(*words, "--train-seeds", "0:2", "--validation-seeds", "0:4")
-    assert outside == "error: validation_seeds must be traffic seeds in 1000..1999, got 0"
-    assert not list(tmp_path.iterdir())

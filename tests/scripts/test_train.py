@@ -79,24 +79,6 @@ def test_the_bar_has_the_error_beside_the_best_rules(tmp_path, monkeypatch):
     assert all(f"validation={error:.1f}" in bar for error in errors)
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--algorithm", "dqn"], "algorithm must be one of ppo, .*, plackett-luce where bandwidth"),
-        (["--minutes", "0"], "minutes must be a finite number > 0 or None, got 0"),
-        (["--steps", "-3"], "steps must be an integer >= 1 or None, got -3"),
-        (["--train-seeds", "998:1001"], r"train_seeds must be .* in 0\.\.999, got 1000"),
-        (["--validation-seeds", "2000"], r"validation_seeds must be .* 1000\.\.1999, got 2000"),
-        (["--env"], r"env must be one or more environments, got \(\)"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(more, message, tmp_path):
-    output = tmp_path / "out"
-    line = refused("train", "--env", SHORT, "--output", output, *more)
-    assert re.search(message, line)
-    assert not output.exists()
-
-
 def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
     given = words(tmp_path, "plackett-luce", "--seed", "0:2", "--workers", "1")
     done = run_command("train", *given)

@@ -67,23 +67,6 @@ def test_rounds_are_read_from_text():
             parse_round(text)
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--train-seeds", "0:2000"], r"train_seeds must be traffic seeds in 0\.\.999"),
-        (["--rounds", "own:0:4"], r"rounds\.scenarios must be an integer in 1\.\."),
-        (["--initial", "nowhere"], "initial: .*weights must be a file or one of highway, "),
-        (["--plan", "[3]"], "plan must be a mapping"),
-        (["--plan", "{"], "plan must be JSON: "),
-        (["--plan", '{"wide": 3}'], r"plan\.wide is unknown"),
-        (["--plan", '{"ranges": {"sections": 2}}'], r"ranges\.sections must be a number in"),
-    ],
-)
-def test_bad_arguments_are_named(more, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        make_plan(arguments(tmp_path, *more), "flows", 0)
-
-
 def test_an_episode_is_no_longer_than_the_records_of_the_roads(tmp_path):
     short = arguments(tmp_path, "--env", SHORT)
     assert make_plan(replace(short, plan="{}"), "flows", 0).seconds == 240

@@ -89,30 +89,3 @@ def finished(journal):
     storage = optuna.storages.JournalStorage(backend)
     (name,) = optuna.get_all_study_names(storage)
     return n_finished(optuna.load_study(study_name=name, storage=storage))
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--workers", "0"], "workers must be an integer in 1..10000, got 0"),
-        (["--trials", "0"], "trials must be an integer >= 1, got 0"),
-        (["--policies", "random", "round-robin"], "policies must be one with --tune"),
-        (["--train-seeds", "2000:2008"], "train_seeds must be traffic seeds"),
-        (["--test-seeds", "2000:2008"], "--test-seeds must be left out with --tune"),
-        (["--keep-fitted"], "--keep-fitted must be left out with --tune"),
-        (["--estimators", "recurrent"], "estimators must be one of ekf"),
-        (["--also", "demand"], "also must leave out demand for 'random_walk'"),
-        (["--env", f'{SHORT} {{"estimator": "ukf"}}'], "env.estimator must be left out"),
-        (["--env", f'{SHORT} {{"cargo": 1}}'], "cargo"),
-        (["road.toml", "--env", f'{SHORT} {{"corridor": {{}}}}'], "env.corridor must be left out"),
-    ],
-)
-def test_bad_arguments_are_named_and_nothing_is_written(words, message, tmp_path):
-    assert message in refused(*TUNE, "--env", SHORT, "--output", tmp_path / "out", *words)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("option", [["--also", "demand"], ["--seed", "1"], ["--force"]])
-def test_options_of_tune_are_refused_without_it(option):
-    assert f"{option[0]} must be left out without --tune" in refused("fit", "my-road.toml", *option)
-    assert refused("fit") == "error: road must be given, unless with --tune"
