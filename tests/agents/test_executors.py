@@ -7,7 +7,7 @@ import sys
 import threading
 import warnings
 from concurrent.futures import Future
-from typing import ClassVar
+from pathlib import Path
 
 import loky
 import pytest
@@ -28,12 +28,10 @@ def reciprocal(number):
     return 1 / number
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_tasks_come_back_with_their_results_and_errors_as_they_are(workers):
-    executor = make_executor("local", workers)
-    assert run_in_order(executor, operator.neg, range(300, 306)) == [-k for k in range(300, 306)]
+def test_one_worker_is_the_calling_process_and_errors_come_as_they_are():
+    executor = make_executor("local", 1)
+    assert run_in_order(executor, lambda _: os.getpid(), [0]) == [os.getpid()]
     assert run_in_order(executor, operator.neg, []) == []
-    assert run_in_order(executor, operator.neg, [1, 1, 2, 1]) == [-1, -1, -2, -1]
     with pytest.raises(ZeroDivisionError):
         run_in_order(executor, reciprocal, [1, 0, 2])
 
@@ -62,76 +60,73 @@ def test_a_result_is_handed_over_before_the_next_task_begins_and_the_bar_has_its
     assert "5/5" in bar.getvalue()
 
 
-def meet(folder):
-    """Wait for another process that does the same; return this one."""
-    (folder / str(os.getpid())).touch()
-    wait_for(lambda: len(list(folder.iterdir())) >= 2)
-    return os.getpid()
-
-
-def interrupted(number):
-    os.kill(os.getpid(), signal.SIGTERM if number else signal.SIGINT)
-    return number
-
-
-def test_there_are_as_many_processes_as_asked_for_and_they_leave_interrupts_to_this_one(tmp_path):
-    executor = make_executor("local", 2)
-    places = run_in_order(executor, meet, [tmp_path] * 8)
-    assert {str(place) for place in places} == {each.name for each in tmp_path.iterdir()}
-    assert len({*places} - {os.getpid()}) == 2
-    assert run_in_order(executor, interrupted, range(2)) == [0, 1]
-
-
-def n_warnings(module):
+def here(places):
+    """Wait until two processes are here, and return what this one is like."""
+    Path(places, str(os.getpid())).touch()
+    wait_for(lambda: len([*Path(places).iterdir()]) >= 2)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        os.kill(os.getpid(), number)
     with warnings.catch_warnings(record=True) as given:
-        warnings.warn_explicit("again", UserWarning, "file.py", 1, module)
-    return len(given)
+        for module in ("dptse_env.config", "torch"):
+            warnings.warn_explicit("again", UserWarning, "file.py", 1, module)
+    return os.getpid(), os.getenv("OMP_NUM_THREADS"), len(given), compiling_is_said.is_set()
 
 
-def is_said(_):
-    return compiling_is_said.is_set()
-
-
-def test_processes_have_one_thread_and_do_not_repeat_what_this_one_has_said(monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+def test_processes_are_as_many_as_asked_for_and_leave_interrupts_and_messages_to_this_one(
+    tmp_path, monkeypatch
+):
     said = threading.Event()
     said.set()
     monkeypatch.setattr("agents.executors.compiling_is_said", said)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "places").mkdir()
     executor = make_executor("local", 2)
-    assert run_in_order(executor, n_warnings, ["dptse_env.config", "torch"]) == [0, 1]
-    assert run_in_order(executor, is_said, [1]) == [True]
-    assert run_in_order(executor, os.getenv, ["OMP_NUM_THREADS"]) == ["1"]
+    found = run_in_order(executor, here, ["places"] * 8)
+    places, *others = map(set, zip(*found, strict=True))
+    assert places == {int(path.name) for path in Path("places").iterdir()}
+    assert len(places - {os.getpid()}) == 2
+    assert others == [{"1"}, {1}, {True}]
+    assert run_in_order(executor, operator.neg, [300, 1, 300, 2]) == [-300, -1, -300, -2]
+    with pytest.raises(ZeroDivisionError):
+        run_in_order(executor, reciprocal, [1, 0, 2])
+    monkeypatch.chdir("places")
+    assert run_in_order(executor, os.path.realpath, ["a"]) == [os.path.realpath("a")]
 
 
-def test_tasks_run_in_the_folder_of_this_process(tmp_path, monkeypatch):
-    executor = make_executor("local", 2)
-    for folder in (tmp_path, tmp_path.parent):
-        monkeypatch.chdir(folder)
-        assert run_in_order(executor, os.path.realpath, ["a"]) == [os.path.realpath("a")]
+class Mortal:
+    """Processes in this one, which die as often as they should."""
+
+    def __init__(self, **deaths):
+        self.deaths, self.ended = deaths, []
+
+    def submit(self, work, task):
+        future = Future()
+        try:
+            if self.deaths.get(task):
+                self.deaths[task] -= 1
+                raise loky.BrokenProcessPool
+            future.set_result(work(task))
+        except Exception as problem:
+            future.set_exception(problem)
+        return future
+
+    def shutdown(self, **how):
+        self.ended.append(how)
 
 
 def test_a_task_whose_worker_died_runs_again_three_times(monkeypatch):
-    """With processes in this one, which die as often as they should."""
-
-    class Mortal:
-        deaths: ClassVar = {-1: 3, -2: 6}
-
-        def submit(self, work, task):
-            future = Future()
-            if self.deaths.get(task):
-                self.deaths[task] -= 1
-                future.set_exception(loky.BrokenProcessPool())
-            else:
-                future.set_result(work(task))
-            return future
-
-    pool, executor = Mortal(), make_executor("local", 2)
+    pool, executor = Mortal(a=3, b=6), make_executor("local", 2)
     monkeypatch.setattr(loky, "get_reusable_executor", lambda *_, **__: pool)
-    assert run_in_order(executor, abs, [-1, -2]) == [1, 2]  # three times after the last result
-    pool.deaths[-2] = 4
+    assert run_in_order(executor, ord, "ab") == [97, 98]  # three times after the last result
+    pool.deaths["b"] = 4
     with pytest.raises(ExecutorError, match="a task was lost 4 times"):
-        run_in_order(executor, abs, [1, -2])
-    assert pool.deaths[-2] == 0
+        run_in_order(executor, ord, "cb")
+    assert pool.deaths["b"] == 0
+    assert not pool.ended
+    with pytest.raises(TypeError):  # what still runs is ended where another fails
+        run_in_order(executor, ord, ["a", "bc"])
+    assert pool.ended == [{"kill_workers": True}]
 
 
 PROGRAM = """
@@ -149,6 +144,7 @@ while {forever} or len(list(folder.iterdir())) < 2:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("one_fails", [False, True])
 def test_what_still_runs_is_ended_where_another_fails_or_the_program_is_killed(tmp_path, one_fails):
     tasks = [TASK.format(folder=str(tmp_path), forever=each) for each in (True, not one_fails)]
@@ -164,16 +160,17 @@ def test_what_still_runs_is_ended_where_another_fails_or_the_program_is_killed(t
             program.kill()
 
 
-def test_one_worker_is_the_calling_process():
-    assert run_in_order(make_executor("local", 1), lambda _: os.getpid(), [0]) == [os.getpid()]
-    for workers in (0, 1.5):
-        with pytest.raises(ValueError, match="workers must be an integer >= 1"):
-            make_executor("local", workers)
-
-
-def test_an_address_belongs_to_a_cluster():
-    with pytest.raises(ValueError, match="address must be given with the executor ray, got 'auto'"):
-        make_executor("local", 1, "auto")
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("local", 0), "workers must be .* got 0"),
+        (("local", 1.5), "workers must be .* got 1.5"),
+        (("local", 1, "auto"), "address must be .* got 'auto'"),
+    ],
+)
+def test_wrong_words_are_named(words, said):
+    with pytest.raises(ValueError, match=said):
+        make_executor(*words)
 
 
 def test_the_extra_is_named_where_ray_is_missing(monkeypatch):
