@@ -42,6 +42,7 @@ def test_a_guarantee_is_not_rejected_and_too_little_noise_is(tmp_path, capsys):
     assert weak["noise"]["p_value"] < 1e-10
 
 
+@pytest.mark.slow
 def test_what_the_paper_promises_is_rejected_with_vehicles_of_the_record(tmp_path):
     found = run(tmp_path, {"preset": "printed", "epsilon": 1.0}, target="replaced", trials=100)
     assert found["verdict"] == "rejected"
@@ -74,6 +75,7 @@ def test_a_model_that_states_nothing_is_held_to_what_was_asked_of_it(tmp_path):
     assert found["privacy"]["mu"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 0.4])
 def test_the_paced_ledger_is_attacked_with_the_estimator_of_the_environment(factor, tmp_path):
     paced = {"preset": "paced", "epsilon": 5.0}
@@ -87,9 +89,11 @@ def test_the_paced_ledger_is_attacked_with_the_estimator_of_the_environment(fact
 @pytest.mark.parametrize(
     ("privacy", "factor", "verdict"),
     [
-        ({"preset": "printed", "epsilon": 1.0}, 1.0, "rejected"),
+        pytest.param(
+            {"preset": "printed", "epsilon": 1.0}, 1.0, "rejected", marks=pytest.mark.slow
+        ),
         (CAPPED, 1.0, "not rejected"),
-        (CAPPED, 0.4, "rejected"),
+        pytest.param(CAPPED, 0.4, "rejected", marks=pytest.mark.slow),
     ],
 )
 def test_one_run_says_the_same(privacy, factor, verdict, tmp_path, capsys):
