@@ -115,6 +115,26 @@ def test_links_of_the_package_page_lead_to_the_repository_at_a_tag_or_are_words(
     assert for_package_page(PAGE, None, "v1.2") == words + rest
 
 
+def test_the_paper_has_its_sections_and_cites_what_its_bibliography_has():
+    paper, bibliography, citation = (
+        (ROOT / name).read_text(encoding="utf-8")
+        for name in ("paper/paper.md", "paper/paper.bib", "CITATION.cff")
+    )
+    _, head, text = paper.split("---\n", 2)
+    sections = re.findall(r"^# (.*)$", text, re.MULTILINE)
+    assert sections[:4] == ["Summary", "Statement of need", "State of the field", "Software design"]
+    assert sections[4:] == ["Research impact statement", "Acknowledgements", "References"]
+    assert 750 <= len(text.split()) <= 1_100
+    keys = re.findall(r"^@\w+\{(\w+),$", bibliography, re.MULTILINE)
+    assert sorted(keys) == sorted(set(re.findall(r"@(\w+)", text)))
+    authors = citation.partition("\nreferences:")[0].partition("\nauthors:")[2]
+    names = re.findall(r"- name: (.*)", authors)
+    assert names
+    assert names == re.findall(r"- name: (.*)", head.partition("affiliations:")[0])
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert names == [each["name"] for each in project["authors"]]
+
+
 def test_every_file_states_the_same_version_and_repository():
     project, changelog, citation = (
         (ROOT / name).read_text(encoding="utf-8")

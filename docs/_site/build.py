@@ -30,7 +30,8 @@ def sources() -> dict[Path, Path]:
     files = [path for path in docs.rglob("*") if path.is_file() and "_site" not in path.parts]
     found = {path: path.relative_to(docs) for path in files}
     found |= {path: path.relative_to(ROOT) for path in ROOT.glob("results/*/*.md")}
-    return found | {ROOT / "CONTRIBUTING.md": Path("contributing.md")}
+    beside = ("CONTRIBUTING.md", "CHANGELOG.md")
+    return found | {ROOT / name: Path(name.lower()) for name in beside}
 
 
 def prepare() -> None:
