@@ -19,11 +19,14 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import product
 from pathlib import Path
+from textwrap import fill
 from typing import Any, NamedTuple
 
+import numpy as np
 import polars as pl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from agents.environments import GUARANTEE, LONG, PAPER, PRIVATE, SHORT, guarantee_of
 from agents.figures import (
@@ -33,7 +36,6 @@ from agents.figures import (
     Look,
     draw_curve,
     draw_dot,
-    draw_rule,
     finish_figure,
     make_figure,
     save_figure,
@@ -355,44 +357,74 @@ def setting_table(rows: pl.DataFrame, curves: pl.DataFrame, setting: str) -> str
     return table("policy", dict(zip(ranked, ranked, strict=True)), columns)
 
 
-def _panels(titles: Iterable[str], label: str = "", **options: Any) -> tuple[Figure, list[Axes]]:
-    """Return a figure of up to eight panels with titles; ``label`` is that of their left edge."""
-    figure, named = make_figure(7.2, 8.8, dpi=105), list(titles)
+def _panels(
+    titles: Iterable[str], label: str, left: str = "", fold: int = 30, **options: Any
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of up to eight panels with titles, which a phone shows without zooming.
+
+    Args:
+        titles: Of the panels.
+        label: That of all horizontal axes, below the last ones.
+        left: That of all vertical axes.
+        fold: Letters of a line of a title.
+        **options: Of ``subplots``.
+    """
+    figure, named = make_figure(4.4, 7.8), list(titles)
     axes = list(figure.subplots(4, 2, **options).ravel())
     for axis in axes[len(named) :]:
         axis.remove()
-    for axis, title in zip(axes, named, strict=False):
-        axis.set_title(title, fontsize=7)
-    for axis in axes[::2]:
-        axis.set_ylabel(label, fontsize=8)
-    return figure, axes[: len(named)]
+    axes = axes[: len(named)]
+    for axis, title in zip(axes, named, strict=True):
+        unbroken = title.replace(" = ", "\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}")
+        axis.set_title(fill(unbroken, fold), fontsize=7.5, loc="left")
+        axis.xaxis.set_major_locator(MaxNLocator(4))
+    for axis in axes[-2:]:
+        axis.set_xlabel(label, fontsize=8)
+    figure.supylabel(left, fontsize=8)
+    return figure, axes
+
+
+def draw_range(axis: Axes, curves: Iterable[pl.DataFrame], colour: str, label: str) -> None:
+    """Draw the mean of learning curves, with a band from the least to the largest of them."""
+    seeds = [(each["seconds"].to_numpy() / 60.0, each["error"].to_numpy()) for each in curves]
+    if not seeds:
+        return
+    minutes = np.linspace(max(x[0] for x, _ in seeds), min(x[-1] for x, _ in seeds), 40)
+    errors = np.array([np.interp(minutes, *seed) for seed in seeds])
+    axis.plot(minutes, errors.mean(axis=0), color=colour, linewidth=1.3, label=label)
+    axis.fill_between(minutes, *_ends(errors), color=colour, alpha=0.25, linewidth=0)
+
+
+def _ends(errors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return errors.min(axis=0), errors.max(axis=0)
 
 
 def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
     """Draw errors in validation over the time of training, with rules as lines."""
-    figure, axes = _panels((each.title for each in SETTINGS.values()), "error x 1000")
+    titles = (each.title for each in SETTINGS.values())
+    figure, axes = _panels(titles, "minutes of training", "error x 1000")
     for axis, name in zip(axes, SETTINGS, strict=True):
         try:
-            named = (ROUND_ROBIN, best_rule(rows, name))
-            shown = {rule: validation_error(rows, name, rule) for rule in named}
+            named = {ROUND_ROBIN: ROUND_ROBIN, "best rule": best_rule(rows, name)}
+            shown = {label: validation_error(rows, name, rule) for label, rule in named.items()}
         except UnmeasuredError:
             continue
-        for rule, error in shown.items():
-            draw_rule(axis, rule, error)
+        for (label, error), line in zip(shown.items(), (":", "--"), strict=True):
+            axis.axhline(error, color=GREY, linestyle=line, linewidth=1.0, label=label)
         for learner, colour in zip(SHOWN, COLOURS, strict=True):
             own = curves.filter(setting=name, policy=learner).sort("training_seed", "seconds")
-            for _, each in own.group_by("training_seed", maintain_order=True):
-                minutes = each["seconds"] / 60.0
-                axis.plot(minutes, each["error"], color=colour, linewidth=0.9, label=learner)
+            seeds = (each for _, each in own.group_by("training_seed", maintain_order=True))
+            draw_range(axis, seeds, colour, learner)
         # What is not trained yet may err far more than any rule.
         axis.set_ylim(top=1.03 * max(shown.values()))
-        axis.set_xlabel("minutes", fontsize=8)
-    save_figure(finish_figure(figure, columns=4), path, "Errors on validation traffic")
+    title = "Errors on validation traffic; ranges of training seeds"
+    save_figure(finish_figure(figure, columns=3), path, title)
 
 
 def draw_below(rows: pl.DataFrame, path: Path) -> None:
     """Draw how far learners, shipped policies and oracles lie below the best rule."""
-    figure, axes = _panels((each.title for each in SETTINGS.values()), sharey=True)
+    titles = (each.title for each in SETTINGS.values())
+    figure, axes = _panels(titles, BELOW, fold=24, sharey=True)
     for axis, name in zip(axes, SETTINGS, strict=True):
         looks = {
             **dict.fromkeys(SHOWN, (COLOURS[0], "learners, a minute")),
@@ -405,12 +437,11 @@ def draw_below(rows: pl.DataFrame, path: Path) -> None:
             except UnmeasuredError:
                 continue
         axis.axvline(0.0, color=GREY, linewidth=0.8)
-        axis.margins(x=0.2)
+        axis.margins(x=0.3)
         labels = (*SHOWN, "package", ORACLE, GAIN)
         axis.set_yticks([-place for place in range(len(labels))], labels)
-        axis.set_xlabel("below the best rule [%]", fontsize=8)
     title = "Errors below the best rule's; 95 % intervals"
-    save_figure(finish_figure(figure), path, title)
+    save_figure(finish_figure(figure, columns=1), path, title)
 
 
 # What is reported: recorded gains over a round robin, by the share of the road that is queried.
@@ -475,8 +506,9 @@ def gain_table(rows: pl.DataFrame, world: World) -> str:
 
 def draw_gains(rows: pl.DataFrame, path: Path) -> None:
     """Draw gains over the round robin against the share of the road that is queried."""
-    label = f"error below {ROUND_ROBIN} [%]"
-    figure, axes = _panels((each.name for each in WORLDS), label, sharey=True)
+    titles = (each.name for each in WORLDS)
+    left = f"error below {ROUND_ROBIN} [%]"
+    figure, axes = _panels(titles, "segments queried a second [%]", left, sharey=True)
     for axis, world in zip(axes, WORLDS, strict=True):
         bandwidths = BANDWIDTHS[world.road]
         shares = [100.0 * each / N_SEGMENTS[world.road] for each in bandwidths]
@@ -488,10 +520,9 @@ def draw_gains(rows: pl.DataFrame, path: Path) -> None:
                 continue
             draw_curve(axis, shifted(shares, 0.01 * (k - 1), log=True), found, look, label)
         axis.axhline(0.0, color=GREY, linewidth=0.8)
-        set_log(axis, [round(share, 1) for share in shares])
-        axis.set_xlabel("segments queried a second [%]", fontsize=8)
+        set_log(axis, [float(f"{share:.2g}") for share in shares])
     title = f"Gain of choosing queries over {ROUND_ROBIN}; 95 % intervals"
-    save_figure(finish_figure(figure, columns=4), path, title)
+    save_figure(finish_figure(figure, columns=2), path, title)
 
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
