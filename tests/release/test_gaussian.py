@@ -248,6 +248,17 @@ def test_the_sensitivity_of_the_paper_is_exceeded():
     assert found > 3.0 * claimed.mu**2
 
 
+def test_the_sensitivity_of_the_paper_is_that_of_the_shortest_segment():
+    road = UNEVEN.replaced(duration=T)
+    at = np.zeros((1, T + 1), dtype=int)
+    release = Worlds(record(at, 0.0 * at, road.geometry.n_cells), road=road).release(
+        PrivacySettings("corrected")
+    )
+    n_sensors, dwell = dict(release.sensitivity[0].assumptions).values()
+    shortest = math.sqrt(2 * n_sensors * dwell) / min(road.geometry.segment_lengths)
+    assert release.report().releases[0].sensitivity == pytest.approx(shortest)
+
+
 # --- reports -------------------------------------------------------------------------------------
 
 

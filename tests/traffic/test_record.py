@@ -21,7 +21,7 @@ TABLE = {
     "n_columns": 3,
 }
 FIELD = {
-    "field": [[[10.0, 90.0], [0.0, 5.0]], [[20.5, 80.0], [3.0, 70.0]]],
+    "field": [[[10.0, 90.0], [0.0, 5.0]], [[20.5, 80.0], [0.5, 70.0]]],
     "n_steps": 2,
     "n_columns": 2,
 }
@@ -111,7 +111,7 @@ def test_removing_a_vehicle_removes_exactly_its_rows():
 def test_a_field_is_its_own_traffic_with_the_limit_where_the_road_is_empty():
     record = Record(**FIELD)
     traffic = record.traffic(np.array([0.1, 0.2]), np.array([100.0, 60.0]))
-    np.testing.assert_array_equal(traffic, [[[10, 90], [0, 60]], [[20.5, 80], [3, 70]]])
+    np.testing.assert_array_equal(traffic, [[[10, 90], [0, 60]], [[20.5, 80], [0.5, 70]]])
     with pytest.raises(ValueError, match=r"privacy.preset 'paced' needs the vehicles of a record"):
         record.vehicles_for("privacy.preset 'paced'")
 
