@@ -64,7 +64,7 @@ test-fresh: setup  ## Run the tests of properties with examples that are drawn a
 fuzz: setup  ## Try random configurations and hostile files, ten minutes.
 	$(BIN)/python -m tests.fuzz
 
-mutants: setup  ## Break each line of the proof in a copy, and see a fast test fail; a quarter of an hour.
+mutants: setup  ## Break lines of the code in a copy, and see a fast test fail; half an hour.
 	$(BIN)/python -m tests.mutants
 
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.

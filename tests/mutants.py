@@ -1,21 +1,31 @@
-"""Mutants: one-line changes, each of which breaks a line of the proof and must fail a fast test.
+"""Mutants: small changes of the code, each of which must fail a fast test.
 
-``python -m tests.mutants`` makes them one by one in a copy of the repository, runs the tests of
+Those of `MUTANTS` break each a line of the proof. Those of ``tests/mutants.jsonl`` were drawn.
+``python -m tests.mutants`` makes all one by one in a copy of the repository, runs the tests of
 their module there, and prints which test has caught each; with words only the mutants whose name,
 file or line of the proof has one of them. It ends with status 1 where a mutant lives, which is a
-missing test, or where tests fail without one. It takes a quarter of an hour: run it after a change
-to what ``docs/privacy/proof.md`` names.
+missing test, where one cannot be made any more, or where tests fail without one. It takes half an
+hour: run it after a change to what ``docs/privacy/proof.md`` names, and draw mutants anew of lines
+that have changed.
+
+``python -m tests.mutants --draw FILE NUMBER TEST...`` prints the first mutants of a seeded order of
+a file for that record. One that changes nothing that anyone may rely on does not belong there.
 """
 
 from __future__ import annotations
 
+import ast
+import json
 import os
+import random
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,15 +45,16 @@ UNSOUND = re.compile(
 
 
 class Mutant(NamedTuple):
-    """A one-line change of the package.
+    """A one-line change of the code.
 
     Attributes:
         name: What is wrong with it.
-        line: Line of the proof in ``docs/privacy/proof.md`` that it breaks.
-        path: File below ``dptse_env``.
+        line: Line of the proof in ``docs/privacy/proof.md`` that it breaks, 0 for none.
+        path: File below the folder.
         old: Text that stands there exactly once.
         new: What takes its place.
         tests: Files below ``tests``, a fast test of which must fail.
+        folder: Folder below the root.
     """
 
     name: str
@@ -52,11 +63,12 @@ class Mutant(NamedTuple):
     old: str
     new: str
     tests: str
+    folder: str = "dptse_env"
 
     @property
     def file(self) -> Path:
         """The file that is changed, below the root."""
-        return Path("dptse_env", self.path)
+        return Path(self.folder, self.path)
 
     def applied(self, text: str) -> str:
         """Return the text of the file with the change.
@@ -818,19 +830,134 @@ MUTANTS = (
 )  # fmt: skip
 
 
+def recorded() -> list[Mutant]:
+    """Return the mutants that were drawn."""
+    lines = (ROOT / "tests" / "mutants.jsonl").read_text(encoding="utf-8").splitlines()
+    return [
+        Mutant(f"`{each['new'].strip()}`", 0, **each, folder=".") for each in map(json.loads, lines)
+    ]
+
+
+# --- drawing --------------------------------------------------------------------------------------
+
+EXCHANGED = {
+    "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "in": "not in",
+    "not in": "in", "is": "is not", "is not": "is", "+": "-", "-": "+", "*": "/", "/": "*",
+    "//": "*", "%": "//", "**": "*", "&": "|", "|": "&", "and": "or", "or": "and",
+    "min": "max", "max": "min", "minimum": "maximum",
+    "maximum": "minimum", "any": "all", "all": "any", "floor": "ceil", "ceil": "floor",
+    "argmin": "argmax", "argmax": "argmin", "zeros": "ones", "ones": "zeros", "sorted": "list",
+}  # fmt: skip
+OPERATOR = re.compile(r"not in|is not|\b(?:in|is|and|or)\b|\*\*|//|[<>=!]=|[-+*/%<>&|]")
+
+
+def drawn(path: str) -> Iterator[tuple[str, str]]:
+    """Yield text that stands in a file once and what takes its place, in a seeded order.
+
+    Operators, numbers and functions are exchanged, conditions turned round, and statements left
+    out, at most one in a line.
+    """
+    text = (ROOT / path).read_text(encoding="utf-8")
+    lines, done = text.splitlines(), set[int]()
+    found = sorted({each for node in ast.parse(text).body for each in changes(node, lines)})
+    random.Random(path).shuffle(found)
+    for row, start, end, new in found:
+        changed, first = lines[row][:start] + new + lines[row][end:], row
+        while text.count("\n".join(lines[first : row + 1])) > 1:
+            first -= 1
+        if row not in done and "# fmt" not in changed:
+            done.add(row)
+            yield "\n".join(lines[first : row + 1]), "\n".join([*lines[first:row], changed])
+
+
+def changes(node: ast.AST, lines: list[str]) -> Iterator[tuple[int, int, int, str]]:
+    """Yield changes of a syntax tree: row, first column, column after the last, new text."""
+    inside = [*ast.iter_child_nodes(node)]
+    match node:
+        case ast.FunctionDef(args=args, body=body):
+            inside = [*args.defaults, *filter(None, args.kw_defaults), *body]
+        case ast.ClassDef(body=inside):
+            pass
+        case ast.AnnAssign(value=value):
+            inside = [value] if value else []
+        case ast.Expr(value=ast.Constant()) | ast.JoinedStr() | ast.Import() | ast.ImportFrom():
+            return
+        case ast.Raise():
+            inside = []
+    for each in inside:
+        if hasattr(each, "lineno"):
+            yield from changes(each, lines)
+    test = getattr(node, "test", None)
+    for part, new in ((node, exchanged), (test, "not ({})".format)):
+        if part and part.lineno == part.end_lineno and lines[part.lineno - 1].isascii():
+            row, start, end = part.lineno - 1, part.col_offset, part.end_col_offset
+            told = new(part if part is node else lines[row][start:end])
+            if isinstance(part, ast.Compare | ast.BinOp | ast.BoolOp) and part is node:
+                left, right = operands(node)
+                sign = OPERATOR.search(lines[row], left.end_col_offset, right.col_offset)
+                start, end, told = (*sign.span(), EXCHANGED[sign[0]]) if sign else (0, 0, None)
+            elif isinstance(part, ast.Attribute) and part is node:
+                start = end - len(part.attr)
+            if told is not None:
+                yield row, start, end, told
+
+
+def operands(node: ast.Compare | ast.BinOp | ast.BoolOp) -> tuple[ast.AST, ast.AST]:
+    """Return what stands on the two sides of the first operator."""
+    match node:
+        case ast.Compare(left=left, comparators=[right, *_]) | ast.BinOp(left=left, right=right):
+            return left, right
+    return node.values[0], node.values[1]
+
+
+def exchanged(node: ast.AST) -> str | None:
+    """Return what takes the place of a constant, a name or a statement, if anything does."""
+    match node:
+        case ast.Expr() | ast.AugAssign() | ast.Raise():
+            return "pass"
+        case ast.Constant(value=bool()):
+            return str(not node.value)
+        case ast.Constant(value=int() | float()):
+            return repr(node.value + 1)
+        case ast.Name(id=name) | ast.Attribute(attr=name):
+            return EXCHANGED.get(name)
+    return None
+
+
+# --- running --------------------------------------------------------------------------------------
+
+
 def lines_of_the_proof() -> dict[int, str]:
     """Return the titles of the lines of the proof by their numbers."""
     page = (ROOT / "docs" / "privacy" / "proof.md").read_text(encoding="utf-8")
     return {int(n): title for n, title in re.findall(r"^### (\d+)\. (.+)$", page, re.MULTILINE)}
 
 
+def unsound(mutants: list[Mutant]) -> Iterator[str]:
+    """Yield what is wrong with mutants: one that cannot be made, two of a kind, a line without."""
+    for mutant in mutants:
+        try:
+            ast.parse(mutant.applied((ROOT / mutant.file).read_text(encoding="utf-8")))
+        except (OSError, SyntaxError, ValueError) as problem:
+            yield str(problem)
+        yield from (
+            f"{mutant.name}: there is no {test}"
+            for test in mutant.tests.split()
+            if not (ROOT / "tests" / test).is_file()
+        )
+    if len({(m.file, m.old, m.new) for m in mutants}) < len(mutants):
+        yield "two mutants are the same"
+    for line in {*lines_of_the_proof()} ^ {mutant.line for mutant in MUTANTS}:
+        yield f"line {line} of the proof has no mutant, or a mutant no line of the proof"
+
+
 def chosen(words: list[str]) -> list[Mutant]:
     """Return the mutants whose name, file or line of the proof has one of some words."""
     return [
         mutant
-        for mutant in MUTANTS
+        for mutant in (*MUTANTS, *recorded())
         if not words or {str(mutant.line)} & {*words}
-        or any(word in f"{mutant.name} {mutant.path}" for word in words if not word.isdigit())
+        or any(word in f"{mutant.name} {mutant.file}" for word in words if not word.isdigit())
     ]  # fmt: skip
 
 
@@ -857,6 +984,14 @@ def failed(copy: Path, tests: list[str], **environment: str) -> str:
 
 def main(words: list[str]) -> int:
     """Make some mutants, print how each fared, and return the exit status."""
+    if words[:1] == ["--draw"]:
+        _, path, number, *tests = words
+        for old, new in islice(drawn(path), int(number)):
+            print(json.dumps({"path": path, "old": old, "new": new, "tests": " ".join(tests)}))
+        return 0
+    if problems := [*unsound([*MUTANTS, *recorded()])]:
+        print(*problems, sep="\n")
+        return 1
     mutants = chosen(words)
     if not mutants:
         print(f"no mutant has any of {words} in its name, file or line of the proof")

@@ -79,15 +79,6 @@ def test_the_example_that_the_help_of_a_command_begins_with_can_be_parsed():
             check(line)
 
 
-def test_a_command_with_an_unknown_option_would_be_noticed():
-    for line in ("dptse record --test-sedes 2000:2004", "dptse evaluate --test-seeds"):
-        with pytest.raises(SystemExit) as ended:
-            check(line)
-        assert ended.value.code == 2
-    with pytest.raises(KeyError):
-        check("dptse trian --seed 0")
-
-
 def test_inline_commands_name_programs_that_exist():
     for page in PAGES:
         for name in re.findall(r"`dptse ([a-z][a-z-]*)", page.read_text(encoding="utf-8")):
