@@ -44,12 +44,12 @@ TRUTH, QUERIES, ESTIMATE = 2.2, 1.25, 0.0  # heights of the strips
 STRIPS = {
     TRUTH: ("traffic", "as it is"),
     QUERIES: ("queries", "two a second"),
-    ESTIMATE: ("estimate", "from noisy sums"),
+    ESTIMATE: ("estimate", "noisy sums"),
 }
 LINES = {"paper's schedule": (COLOURS[1], 1.5), "this rule": (INK, 2.0)}
 LARGEST = 200.0  # density at the end of the colours [veh/km]
 MEMORY = 20  # seconds over which errors are averaged
-LEFT, RIGHT = 0.145, 0.905  # of the road and the curve, as shares of the width
+LEFT, RIGHT = 0.19, 0.865  # of the road and the curve, as shares of the width
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class Film:
         """Lay out the strips and the curve."""
         self.scene = scene
         n = len(scene.history.lengths)
-        self.figure = Figure(figsize=(7.6, 3.9), dpi=100)
+        self.figure = Figure(figsize=(5.2, 4.1), dpi=140)
         self.canvas = FigureCanvasAgg(self.figure)
-        road = self.figure.add_axes((LEFT, 0.36, RIGHT - LEFT, 0.63), xlim=(0, n), ylim=(-0.1, 3.9))
+        road = self.figure.add_axes((LEFT, 0.38, RIGHT - LEFT, 0.61), xlim=(0, n), ylim=(-0.1, 3.9))
         road.axis("off")
         self.strips = {}
         style = {"color": INK, "va": "center"}
@@ -114,24 +114,22 @@ class Film:
             height = 0.55 if bottom == QUERIES else 0.8
             self.strips[bottom] = add_strip(road, bottom, height, n)
             middle = bottom + height / 2
-            road.text(-0.15, middle + 0.16, name, ha="right", weight="bold", size=11, **style)
-            road.text(-0.15, middle - 0.2, more, ha="right", size=8, color=COLOURS[-1], va="center")
+            road.text(-0.2, middle + 0.17, name, ha="right", weight="bold", size=10, **style)
+            road.text(-0.2, middle - 0.2, more, ha="right", size=8, color=COLOURS[-1], va="center")
         road.text(0.06, 3.7, "driving direction  →", size=9, **style)
-        self.clock = road.text(n - 0.06, 3.7, "", ha="right", size=11, **style)
+        self.clock = road.text(n - 0.06, 3.7, "", ha="right", size=10, **style)
         self.incident = road.text(
             scene.segment + 0.5, 3.4, "incident\n▼", ha="center", va="center",
             size=9, weight="bold", color=COLOURS[1],
         )  # fmt: skip
         self._add_bar()
-        curve = self.figure.add_axes((LEFT, 0.125, RIGHT - LEFT, 0.185))
+        curve = self.figure.add_axes((LEFT, 0.115, RIGHT - LEFT, 0.19))
         self.curves = [
             curve.plot([], [], color=colour, lw=width)[0] for colour, width in LINES.values()
         ]
         self.errors = [
-            curve.text(
-                at, 1.06, "", size=10, weight="bold", color=colour, transform=curve.transAxes
-            )
-            for at, (colour, _) in zip((0, 0.5), LINES.values(), strict=True)
+            curve.text(at, 1.08, "", size=8, weight="bold", color=colour, transform=curve.transAxes)
+            for at, (colour, _) in zip((0, 0.61), LINES.values(), strict=True)
         ]
         curve.set(xlim=(SECONDS[0], SECONDS[-1]), ylim=(0, 30), yticks=(0, 10, 20, 30))
         curve.set_xlabel("time [s]", size=9)
@@ -140,7 +138,7 @@ class Film:
 
     def _add_bar(self) -> None:
         shades = ScalarMappable(Normalize(0, LARGEST), SHADES)
-        place = self.figure.add_axes((RIGHT + 0.012, 0.37, 0.016, 0.45))
+        place = self.figure.add_axes((RIGHT + 0.015, 0.39, 0.02, 0.42))
         bar = self.figure.colorbar(shades, place, extend="max", ticks=range(0, 201, 50))
         bar.set_label("density [veh/km]", size=9)
         bar.ax.tick_params(labelsize=8)

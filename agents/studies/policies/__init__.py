@@ -369,7 +369,7 @@ def _panels(
         fold: Letters of a line of a title.
         **options: Of ``subplots``.
     """
-    figure, named = make_figure(4.4, 7.8), list(titles)
+    figure, named = make_figure(4.4, 7.8, dpi=130), list(titles)
     axes = list(figure.subplots(4, 2, **options).ravel())
     for axis in axes[len(named) :]:
         axis.remove()
