@@ -37,6 +37,8 @@ def test_the_dict_is_its_own_json_and_fresh_each_time(preset, penetration):
     for group in first.get("groups", []):
         group.clear()
     assert found.to_dict() == again
+    unstated = dataclasses.replace(found, mu=np.inf, epsilon=np.inf).to_dict()
+    assert (unstated["mu"], unstated["epsilon"]) == (None, None)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -37,16 +38,18 @@ WIDTH, HEIGHT = 100, 48
 """Columns and lines of a screen."""
 
 
-def help_of(name, monkeypatch):
-    monkeypatch.setenv("COLUMNS", str(WIDTH))
-    done = run_command(*name.split(), "--help")
+@cache
+def help_of(name):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", str(WIDTH))
+        done = run_command(*name.split(), "--help")
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_begins_with_an_example_and_fits_a_screen(name, monkeypatch):
-    page = help_of(name, monkeypatch)
+def test_help_begins_with_an_example_and_fits_a_screen(name):
+    page = help_of(name)
     head = page.partition("╭")[0]
     assert re.search(rf"^dptse {name}\b", head, re.MULTILINE)
     lines = page.splitlines()
@@ -72,7 +75,7 @@ def write_data(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name != "import"])
 def test_the_example_of_the_help_runs_as_it_is_printed(name, tmp_path, monkeypatch):
-    page = help_of(name, monkeypatch)
+    page = help_of(name)
     line = re.search(r"^dptse ((?:.*\\\n)*.*)", page, re.MULTILINE)[1].replace("\\\n", " ")
     write_data(tmp_path)
     if name == "fit":
@@ -117,11 +120,11 @@ OLD = [(name, old) for name, options in RENAMED.items() for old in options]
 
 
 @pytest.mark.parametrize(("name", "old"), OLD)
-def test_what_has_the_place_of_an_option_is_told(name, old, monkeypatch):
+def test_what_has_the_place_of_an_option_is_told(name, old):
     new = RENAMED[name][old]
     assert f"{old} is {new} now" in refused(name, f"{old}=1")
     kinds = KINDS if name == "import" else [""]
-    pages = "".join(help_of(f"{name} {kind}", monkeypatch) for kind in kinds)
+    pages = "".join(help_of(f"{name} {kind}") for kind in kinds)
     offered = re.findall(r"--[a-z-]+", pages)
     assert old not in offered
     assert {*re.findall(r"--[a-z-]+", new)} <= {*offered}
@@ -135,10 +138,10 @@ def test_the_line_is_the_same_where_stdout_lacks_letters(encoding, monkeypatch):
     assert err.getvalue() == "error: Missing value for argument '--workers'. Expected 1 values\n"
 
 
-def test_every_command_can_be_quiet_and_can_print_json(monkeypatch):
+def test_every_command_can_be_quiet_and_can_print_json():
     for name in COMMANDS:
         if name != "import":
-            assert {"--json", "--quiet"} <= {*re.findall(r"--[a-z]+", help_of(name, monkeypatch))}
+            assert {"--json", "--quiet"} <= {*re.findall(r"--[a-z]+", help_of(name))}
 
 
 def test_a_quiet_command_prints_json_alone_and_silences_nothing_after_it(caplog):
@@ -204,8 +207,8 @@ def test_information_has_what_a_bug_report_needs():
     page = run_command("info").stdout
     for value in (code_version(), found["packages"]["numpy"]):
         assert value in page
-    for cache in ("records", "kernels"):
-        assert re.search(rf"^{cache}: \d+ files, [\d.]+ MB in /", page, re.MULTILINE)
+    for kept in ("records", "kernels"):
+        assert re.search(rf"^{kept}: \d+ files, [\d.]+ MB in /", page, re.MULTILINE)
     assert len(page.splitlines()) <= 24
 
 

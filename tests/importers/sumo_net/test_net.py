@@ -46,3 +46,8 @@ def test_files_that_are_no_nets_are_refused(tmp_path, content, message):
 def test_damaged_nets_are_refused(files, tmp_path, pattern, change, message):
     damaged = re.sub(pattern, change, files.net.read_text())
     assert message in refused(tmp_path / "road.net.xml", damaged.encode())
+
+
+def test_a_path_is_no_loop(files):
+    with pytest.raises(ValueError, match=f"path: must not be a loop, got .*{PATH[0]}.* twice"):
+        segment_path(files, [*PATH, PATH[0]], 100.0)
