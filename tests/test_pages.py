@@ -18,6 +18,7 @@ from tests.helpers import ROOT
 PAGES = sorted(ROOT.glob("*.md"))
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
+RULE = re.compile(r"^\|(?: *:?-+:? *\|)+$", re.MULTILINE)  # below the head of a table
 
 
 def anchors(page):
@@ -51,6 +52,13 @@ def test_what_docstrings_refer_to_is_there():
         for name in re.findall(r"`(dptse_env(?:\.\w+)+)`", path.read_text(encoding="utf-8")):
             if name != "dptse_env.plugins":  # the group of entry points
                 pkgutil.resolve_name(name)
+
+
+def test_tables_of_pages_fit_a_phone():
+    pages = [*PAGES, *(ROOT / "docs").rglob("*.md"), *(ROOT / "results").glob("*/README.md")]
+    for page in pages:
+        for rule in RULE.findall(page.read_text(encoding="utf-8")):
+            assert rule.count("|") - 1 <= 6, page
 
 
 def test_the_page_on_architecture_has_every_command_with_its_modules():
