@@ -94,6 +94,12 @@ def test_less_than_a_vehicle_is_one_and_all_connected_vehicles_have_no_error():
     np.testing.assert_allclose(found.sigma, 3.0, rtol=1e-15)
 
 
+def test_a_segment_where_none_is_connected_has_the_speed_limit():
+    """One of 20 vehicles is, on average, so none with a probability of 1 / e."""
+    found = read(np.ones((1, S, 2)), 0.05, n=20, speed=60.0, flow=False).sigma[0, :N, 1]
+    np.testing.assert_allclose(found**2, 0.95 * SPREAD**2 + np.exp(-1.0) * (LIMIT - 60.0) ** 2)
+
+
 def test_deviations_of_noise_are_scaled_by_the_share():
     for model, settings, expected in (
         (Paced, PacedSettings(), [20.0, 30.0]), (Corrected, CappedSettings(), [20.0, 3.0]),
