@@ -251,7 +251,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
         gym.Env.reset(self, seed=seed)
         outcome = self.process.reset(_ONLY, [self.np_random], options)
         if self.drawing is not None:
-            self.drawing.begin(self.process)
+            self.drawing.begin(self.process, self.id)
         return outcome.observation[0], self.process.info(0)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

@@ -87,6 +87,11 @@ class QueryEnvBase:
         self._spec = spec and replace(spec, max_episode_steps=self.n_steps)
 
     @property
+    def id(self) -> str:
+        """Its id, empty where it was made without one."""
+        return self.spec.id if self.spec is not None else ""
+
+    @property
     def n_steps(self) -> int | None:
         """Steps of an episode; None where they depend on the actions."""
         actions = self.interface.actions

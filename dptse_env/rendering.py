@@ -42,7 +42,7 @@ class History:
         estimate: Estimated mainline densities [veh/km], an array (n_mainline,) per second.
         queried: Segments that a query covered, flags (n_mainline,) per second.
         rmse: Density error over the mainline [veh/km], a number per second.
-        title: Road, estimator and bandwidth in words.
+        title: Id or road, estimator and bandwidth in words.
         loops: Places of stations of loops along the mainline [km].
     """
 
@@ -58,8 +58,14 @@ class History:
     loops: tuple[float, ...] = ()
 
     @classmethod
-    def empty(cls, process: QueryProcess, episode: int = 0) -> History:
-        """Return the history of an episode of ``process`` that is to begin."""
+    def empty(cls, process: QueryProcess, episode: int = 0, name: str = "") -> History:
+        """Return the history of an episode of ``process`` that is to begin.
+
+        Args:
+            process: The process.
+            episode: Number of the episode.
+            name: Id of the environment, for the title; that of the road stands in its place.
+        """
         config, corridor = process.config, process.config.corridor
         lengths = corridor.geometry.segment_lengths[: corridor.geometry.n_mainline]
         known = config.estimator
@@ -68,7 +74,8 @@ class History:
         every = config.query_every
         often = "a second" if every == 1 else f"in {every} s"
         unit = "sums" if is_sums else f"of {len(lengths)} segments"
-        title = f"{corridor.name}, estimator {estimator}, queries {config.bandwidth} {unit} {often}"
+        place = name.rpartition("/")[2] or corridor.name
+        title = f"{place}, estimator {estimator}, queries {config.bandwidth} {unit} {often}"
         scale = corridor.scales.density_scale
         loops = tuple(corridor.stations.positions.tolist())
         return cls(episode, config.horizon_steps, lengths, scale, title=title, loops=loops)
@@ -244,9 +251,9 @@ class Drawing:
         self._picture: Picture | None = None
         self._frame: tuple[int, NDArray[np.uint8]] | None = None
 
-    def begin(self, process: QueryProcess) -> None:
-        """Take up an episode that was just reset."""
-        self.history, self._frame = History.empty(process, self.episode), None
+    def begin(self, process: QueryProcess, name: str) -> None:
+        """Take up an episode that was just reset, of an environment with some id, or none."""
+        self.history, self._frame = History.empty(process, self.episode, name), None
         self.history.append(process)
         if self.screen is not None:
             self.screen.reopen()

@@ -257,7 +257,7 @@ class SensorQueryVectorEnv(QueryEnvBase, VectorEnv[Observation, Action, Any]):
         generators = [self._generator(e)[0] for e in episodes]
         self._observation[episodes] = self.process.reset(episodes, generators, options).observation
         if self.drawing is not None and self.render_episode in episodes:
-            self.drawing.begin(self.process)
+            self.drawing.begin(self.process, self.id)
 
     def _infos(self, episodes: IntArray) -> dict[str, Any]:
         return in_vector_form(self.process.infos(episodes), episodes, self.num_envs)
