@@ -71,6 +71,6 @@ def test_an_episode_is_no_longer_than_the_records_of_the_roads(tmp_path):
     short = arguments(tmp_path, "--env", SHORT)
     assert make_plan(replace(short, plan="{}"), "flows", 0).seconds == 240
     long = make_plan(replace(short, plan='{"seconds": 241}'), "flows", 0)
-    message = r"plan\.seconds must be at most 240 s, the length of a record of dptse_env:.*got 241"
+    message = r"plan\.seconds must be at most 240 s, the length of a record of .*, got 241"
     with pytest.raises(ValueError, match=message):
         long.check()

@@ -115,7 +115,9 @@ USES = {
         """'policies {"minutes": 1, "seeds": 3}'""": "seeds must be … 3",
         """'policies {"seeds": "0:2"}'""": "seeds must be left out without minutes",
         "examples.my_study:STUDY --test-seeds all": "test_seeds must be … 'all'",
-        "examples.my_study:STUDY --env SHORT --report --quiet": "env must be left out",
+        "examples.my_study:STUDY --env dptse_env:dptse/ShortHighway-v0 --report --quiet": (
+            "env must be left out"
+        ),
         "examples.my_study:STUDY --workers 0": "workers must be … 0",
         "examples.my_study:STUDY --report": "rows.parquet",
         """examples.my_study:STUDY --env 'SHORT {"bandwidth": 1}'""": "env must be of",
