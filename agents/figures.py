@@ -135,7 +135,9 @@ def draw_errors(
     """
     most = max(sum(row in each for each in series.values()) for row in rows)
     panels = list(next(each[row] for each in series.values() for row in rows if row in each))
-    figure = make_figure(WIDTH, 1.1 + (0.18 + 0.12 * most) * len(rows), dpi=160)
+    # A single panel is as narrow as a phone.
+    width = WIDTH - 1.4 * max(3 - len(panels), 0)
+    figure = make_figure(width, 1.1 + (0.18 + 0.12 * most) * len(rows), dpi=160)
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     axes[0].set_yticks([-place for place in range(len(rows))], rows)
     colours = dict(zip(series, cycle(COLOURS), strict=False))
