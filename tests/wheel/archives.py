@@ -23,7 +23,7 @@ IN_A_WHEEL = {"", ".json", ".parquet", ".py", ".safetensors", ".toml", ".txt", "
 """Kinds of files of the packages: code, settings, weights, SUMO nets, rows, policies, roads,
 digests."""
 
-FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "tests"}
+FOLDERS = {*PACKAGES, "benchmarks", "docs", "examples", "paper", "tests"}
 """Folders of a source archive."""
 BESIDE_THEM = {
     ".gitignore", "CHANGELOG.md", "CITATION.cff", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md",
@@ -31,7 +31,7 @@ BESIDE_THEM = {
     "pyproject.toml", "zensical.toml",
 }  # fmt: skip
 IN_A_SOURCE_ARCHIVE = IN_A_WHEEL | {
-    ".css", ".gif", ".ipynb", ".md", ".npz", ".png", ".yaml", ".yml"
+    ".bib", ".css", ".gif", ".ipynb", ".md", ".npz", ".png", ".yaml", ".yml"
 }  # fmt: skip
 
 LARGEST = 4_000_000
