@@ -7,6 +7,7 @@ import pytest
 
 from dptse_env.config import resolve
 from dptse_env.traffic import SHORT_HIGHWAY, Loops, read_corridor, write_corridor
+from dptse_env.traffic.loops import Stations
 
 PLACES = {"positions": [0.0, 0.3, 0.6]}
 
@@ -76,3 +77,12 @@ def test_keywords_of_loops_survive_json():
     config = resolve("short-plain", {"loops": PLACES | {"ramps": [2]}})
     loops = json.loads(json.dumps(config.corridor.fields()))["loops"]
     assert resolve("short-plain", {"loops": loops}).corridor == config.corridor
+
+
+def test_stations_at_the_ends_name_the_segment_where_vehicles_come_or_leave():
+    geometry = SHORT_HIGHWAY.geometry
+    stations = Stations.of(Loops((0.0, 0.3, 0.6), ramps=(2,)), geometry)
+    assert stations.enters.tolist() == [0, -1, -1, -1]
+    assert stations.leaves.tolist() == [-1, -1, 5, -1]
+    assert stations.positions.tolist() == [0.0, 0.3, 0.6, 0.2]
+    assert Stations.of(None, geometry).upstream.shape == (0, geometry.n_cells)
