@@ -65,9 +65,9 @@ SCHEDULES = (
     "expected-reduction", "greedy-trace", "oracle-error", "oracle-gain",
 )  # fmt: skip
 POLICIES = {
-    "private-highway": "paced",
-    "private-highway-capped": "capped",
     "short-highway": "printed",
+    "short-highway-corrected": "corrected",
+    "short-highway-capped": "capped",
 }
 """Some policies of the package, and the release models that they were trained for."""
 RELEASES: dict[str, dict[str, Any]] = {

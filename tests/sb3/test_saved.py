@@ -296,13 +296,13 @@ def test_another_release_is_told_unless_it_is_allowed(path, trained, here, told)
 
 
 def test_a_shipped_policy_tells_of_the_epsilon_of_the_id():
-    env = make_env(bandwidth=1, privacy="paced")
+    env = make_env(bandwidth=1, privacy="corrected")
     message = (
-        r"^policy 'short-highway-paced' was trained for another release: privacy\.epsilon is 5\.0 "
-        r"for the policy and 1\.0 for the environment$"
+        r"^policy 'short-highway-corrected' was trained for another release: privacy\.epsilon is "
+        r"5\.0 for the policy and 1\.0 for the environment$"
     )
     with pytest.warns(UserWarning, match=message):
-        load_policy("short-highway-paced", env)
+        load_policy("short-highway-corrected", env)
 
 
 def test_a_perceptron_stays_on_its_road(path):

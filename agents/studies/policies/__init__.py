@@ -43,7 +43,6 @@ from agents.figures import (
     shifted,
 )
 from agents.play import Cell
-from agents.policies import find_policy
 from agents.seeds import STUDY_TEST, TRAINING_VALIDATION
 from agents.statistics import Interval, bootstrap, interquartile_mean, percent_below
 from agents.study import Place, Study, read_table
@@ -74,7 +73,7 @@ RULES = (
 PLACKETT_LUCE = "plackett-luce"
 LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "ppo-perceptron": ("ppo", {"policy": "mlp"}),
-    "ppo-road": ("ppo", {}),
+    "ppo-road": ("ppo", {"gamma": 0.9}),
     "maskable-ppo": ("maskable-ppo", {}),
     "recurrent-ppo": ("recurrent-ppo", {}),
     "qr-dqn": ("qr-dqn", {}),
@@ -159,12 +158,6 @@ SETTINGS = {
     ),
     "capped": Setting("PaperHighway-v0, capped, B = 5", PAPER, _ONE | _CAPPED | _TUNED),
 }
-SHIPPED = {
-    "short": "short-highway", "short-paced": "short-highway-paced",
-    **dict.fromkeys(("private-1", "private-2", "long"), "private-highway"),
-    "capped": "paper-highway-capped",
-}  # fmt: skip
-"""Policies that come with the package, by setting: `PLACKETT_LUCE` after nine minutes, not one."""
 CURVES = "curves.parquet"
 """Learning curves of the trainings that are finished, a line for each validation, with the digest
 of the best policy."""
@@ -190,23 +183,15 @@ def _cell(
         policy=file or policy,
         keywords=setting.keywords,
         labels={**played(name, policy, part), "training_seed": seed, "digest": digest},
-        transferred=policy in SHIPPED.values(),
         noise_seed=(STUDY_TEST if part == TEST else TRAINING_VALIDATION).start,
         seeds=seeds if part == TEST else traffic.validation,
     )
 
 
 def test_cells(rows: pl.DataFrame, place: Place) -> list[Cell]:
-    """Return what plays test traffic.
-
-    Rules, oracles, policies of the package, and the best ones of the trainings that are finished.
-    """
+    """Return what plays test traffic: rules, oracles, and the best policy of each training."""
     del rows  # choices among these are the report's
     cells = [_cell(*each, TEST) for each in product(SETTINGS, (*RULES, ORACLE, GAIN))]
-    cells += [
-        _cell(name, policy, TEST, digest=find_policy(policy).identity)
-        for name, policy in SHIPPED.items()
-    ]
     trained = (
         read_curves(place.folder).select("setting", "policy", "training_seed", "digest").unique()
     )
@@ -422,13 +407,12 @@ def draw_curves(rows: pl.DataFrame, curves: pl.DataFrame, path: Path) -> None:
 
 
 def draw_below(rows: pl.DataFrame, path: Path) -> None:
-    """Draw how far learners, shipped policies and oracles lie below the best rule."""
+    """Draw how far learners and oracles lie below the best rule."""
     titles = (each.title for each in SETTINGS.values())
     figure, axes = _panels(titles, BELOW, fold=24, sharey=True)
     for axis, name in zip(axes, SETTINGS, strict=True):
         looks = {
             **dict.fromkeys(SHOWN, (COLOURS[0], "learners, a minute")),
-            SHIPPED.get(name, ""): (COLOURS[1], "policies of the package, nine minutes"),
             **dict.fromkeys((ORACLE, GAIN), (GREY, "oracles")),
         }
         for place, (policy, look) in enumerate(looks.items()):
@@ -438,7 +422,7 @@ def draw_below(rows: pl.DataFrame, path: Path) -> None:
                 continue
         axis.axvline(0.0, color=GREY, linewidth=0.8)
         axis.margins(x=0.3)
-        labels = (*SHOWN, "package", ORACLE, GAIN)
+        labels = (*SHOWN, ORACLE, GAIN)
         axis.set_yticks([-place for place in range(len(labels))], labels)
     title = "Errors below the best rule's; 95 % intervals"
     save_figure(finish_figure(figure, columns=1), path, title)
@@ -531,8 +515,7 @@ def report(rows: pl.DataFrame, folder: Path) -> str:
     named = {*played("", ""), "training_seed", "digest"} - set(rows.columns)
     rows = rows.with_columns(pl.lit(None).alias(name) for name in sorted(named))
     # A training that was begun anew has left rows of the policy that it had before.
-    shipped = [find_policy(each).identity for each in SHIPPED.values()]
-    present = ["", *shipped, *curves["digest"].unique()]
+    present = ["", *curves["digest"].unique()]
     rows = rows.filter(pl.col("digest").cast(pl.String).fill_null("").is_in(present))
     parts = ["# Query policies"]
     if not rows.filter(part=TEST).is_empty():

@@ -14,7 +14,6 @@ from agents.studies.policies import GAIN, ORACLE, ROUND_ROBIN, RULES, TEST, VALI
 from agents.studies.policies.trainings import Training, fits, plan_of, train_ladder
 from agents.study import Place, read_rows, read_table, run, write_report, write_table
 from dptse_env.config import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
-from dptse_env.policies import read_policy, shipped_policies
 from tests.agents.training.plans import SMALL
 from tests.helpers import SHORT
 
@@ -169,26 +168,6 @@ def test_traffic_of_trainings_choices_and_tests_is_apart():
         assert set(setting.traffic.gain) <= set(setting.traffic.test)
 
 
-def test_policies_of_the_package_suit_their_settings(tmp_path):
-    cells = policies.test_cells(pl.DataFrame(), Place(tmp_path, this_process))
-    found = {cell.labels["setting"]: cell for cell in cells if cell.transferred}
-    assert {name: cell.policy for name, cell in found.items()} == policies.SHIPPED
-    assert set(policies.SHIPPED.values()) < set(shipped_policies())
-    for cell in found.values():
-        cell.check()
-
-
-def test_rows_of_a_policy_that_was_shipped_before_are_left_out(ladder, errors):
-    rows = read_rows("policies", ladder)
-    kept = read_policy("short-highway").identity
-    for digest, factor in ((kept, 0.9), ("of another file", 0.1)):
-        table = rows_of("short-highway", factor * errors[BEST][0], digest=digest)
-        rows = pl.concat([rows, pl.DataFrame(table)], how="diagonal_relaxed")
-    write_table(ladder / "rows.parquet", rows)
-    write_report(policies.STUDY, ladder)
-    assert line((ladder / "tables.md").read_text("utf-8"), "short-highway")[2].startswith("10.0 [")
-
-
 def test_every_learner_has_a_plan_in_the_settings_that_it_fits():
     pairs = [pair for pair in product(policies.SETTINGS, policies.LEARNERS) if fits(*pair)]
     assert len(pairs) == 7 * 6 - 4
@@ -219,7 +198,6 @@ def test_a_small_ladder_is_trained_played_and_goes_on(tmp_path, monkeypatch):
         monkeypatch.setattr(module, "LEARNERS", learners)
         monkeypatch.setattr(module, "SETTINGS", {"short": setting})
     monkeypatch.setattr(policies, "RULES", (ROUND_ROBIN, OTHER))
-    monkeypatch.setattr(policies, "SHIPPED", {})
     cells = tuple(policies._cell("short", rule, VALIDATION) for rule in (ROUND_ROBIN, OTHER))
     monkeypatch.setattr(policies, "STUDY", replace(policies.STUDY, cells=cells))
     place = Place(tmp_path, this_process)

@@ -164,8 +164,8 @@ def test_plans_that_are_refused(changes, message):
         ),
         (
             "dqn",
-            {"initial": "private-highway"},
-            "initial must be left out .*, got 'private-highway'",
+            {"initial": "short-highway"},
+            "initial must be left out .*, got 'short-highway'",
         ),
     ],
 )
