@@ -17,7 +17,7 @@ import tyro
 
 COMMAND = Path(sys.executable).with_name("dptse")
 ENV = "dptse_env:dptse/ShortHighway-v0"
-ALGORITHM = 'ppo {"gamma": 0.95, "validations": 8}'
+ALGORITHM = 'ppo {"validations": 8}'
 WIDTH = 40
 """Letters of the longest bar."""
 

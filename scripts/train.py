@@ -38,7 +38,7 @@ MINUTES = 10.0
 class Args(Output, Machines, ValidationSeeds, TrainSeeds, Environments, Command):
     """Train a query policy."""
 
-    env: tuple[str, ...] = ("dptse_env:dptse/PrivateHighway-v1",)
+    env: tuple[str, ...] = ("dptse_env:dptse/ShortHighway-v0",)
     """Environments, each an id or 'ID {JSON}' with keywords; plackett-luce takes several."""
     algorithm: str = "ppo"
     """ppo, maskable-ppo, recurrent-ppo, dqn, qr-dqn or plackett-luce, or 'NAME {JSON}' with

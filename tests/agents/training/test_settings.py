@@ -38,8 +38,8 @@ def test_settings_that_are_given_replace_single_ones():
     assert (given.swaps.step, given.swaps.final_step, given.swaps.trials) == (9.0, 1.0, 3)
     assert given.regression == parse_algorithm("plackett-luce", 6).regression
     road, mlp = parse_algorithm("ppo", 6), parse_algorithm('ppo {"policy": "mlp"}', 6)
-    assert (road.policy, road.learning_rate, road.final_ent_coef) == ("road", 1e-3, 0.0)
-    assert (mlp.policy, mlp.learning_rate, mlp.final_ent_coef) == ("mlp", 5e-4, 0.005)
+    assert (road.policy, road.learning_rate, road.gamma) == ("road", 1e-3, 0.95)
+    assert (mlp.policy, mlp.learning_rate, mlp.gamma) == ("mlp", 5e-4, 0.9)
     assert parse_algorithm('ppo {"ent_coef": 0.5}', 6).ent_coef == 0.5
 
 
