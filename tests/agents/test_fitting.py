@@ -415,7 +415,7 @@ def test_no_estimator_is_proposed_that_loses_to_another_one_where_lorries_share_
         name: min(np.mean(each["error"]) for each in compared if each["estimator"] == name)
         for name in ESTIMATORS_TRIED
     }
-    assert least[found["estimator"]] < 0.9 * least["recurrent"]
+    assert least["recurrent"] < 1.1 * least[found["estimator"]], (found["estimator"], least)
 
 
 def test_a_saved_policy_may_be_among_those_to_choose_from(tmp_path):
