@@ -45,6 +45,8 @@ def test_ramps_lie_at_faces_and_acceleration_lanes_count_as_lanes_of_the_mainlin
     assert between == pytest.approx([between[0]] * len(between), abs=1e-4)
     assert 0.09 < between[0] < 0.11
     assert road.segment_lengths[-2:] == (0.1, 0.1)
+    near = segment_path(files, PATH, 100.0, ends=(290.0, None)).geometry
+    assert near.on_ramps == (1,)  # a stretch of little over 100 m also has a boundary segment
     assert road.segment_lanes[:on] == (2,) * on
     # 250 m: two segments, and less than half of one
     assert road.segment_lanes[on : on + 2] == (3, 3)
