@@ -87,8 +87,16 @@ def test_rows_of_tables_are_drawn_apart_and_columns_together():
     )
 
 
-def test_the_bootstrap_is_seeded():
-    table = np.random.default_rng(4).standard_normal((3, 9))
+def test_the_bootstrap_is_seeded_and_lies_between_percentiles():
+    table, drawn = np.random.default_rng(4).standard_normal((3, 9)), []
+
+    def keep(tables):
+        drawn.append(interquartile_mean(tables))
+        return drawn[-1]
+
+    found = bootstrap(keep, table)
+    percentiles = np.percentile(np.concatenate(drawn[:-1]), [2.5, 97.5])  # the last is the mean
+    assert [found.low, found.high] == pytest.approx(percentiles)
     assert bootstrap(interquartile_mean, table, seed=5) == bootstrap(
         interquartile_mean, table, seed=5
     )

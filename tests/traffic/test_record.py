@@ -96,6 +96,13 @@ def test_impossible_records_are_refused():
             Record(**fields)
 
 
+def test_two_vehicles_at_two_steps_are_not_one_that_is_there_twice():
+    record = Record(
+        step=[0, 2], vehicle=[1, 0], segment=[0, 0], speed=[9.0, 9.0], n_steps=3, n_columns=1
+    )
+    assert record.counts[:, 0].tolist() == [1, 0, 1]
+
+
 def test_removing_a_vehicle_removes_exactly_its_rows():
     record = Record(**TABLE)
     adjacent = record.without(4)
