@@ -4,7 +4,6 @@ import dataclasses
 import json
 import re
 import shutil
-import sys
 import tomllib
 import warnings
 
@@ -31,7 +30,7 @@ from dptse_env.model import load_parameters
 from dptse_env.model.parameters import write_parameters
 from dptse_env.traffic import RecordLibrary, read_road, write_corridor
 from scripts.fit import Args, estimators_tried
-from tests.helpers import run_killed, save_untrained
+from tests.helpers import save_untrained
 from tests.scripts.commands import refused, run_command
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
@@ -220,26 +219,6 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
     assert len({str(each) for each in tried}) == len(tried) <= 60
     kept.unlink()
     assert fit_parameters(*arguments) == first
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows kills otherwise")
-def test_a_killed_fit_goes_on_with_what_it_has_tried(tmp_path):
-    path = tmp_path / "my-road.toml"
-    path.write_text(ROAD)
-    words = "fit", path, *BRIEF, "--trials", "20"
-    kept = tmp_path / "my-road-fit" / "stages" / "search.json"
-    where = "agents.fitting.parameters", "write_json", 7
-    assert run_killed(*where, "scripts.dptse", *words).returncode == -9
-    tried = json.loads(kept.read_text())
-    assert len(tried) == 7
-    assert path.read_text() == ROAD
-    done = run_command(*words)
-    assert done.returncode == 0, done.stderr
-    after = json.loads(kept.read_text())
-    assert after[: len(tried)] == tried
-    assert len(tried) < len(after) <= 21
-    assert "[environment]" in path.read_text()
 
 
 def error_of(given, tried):

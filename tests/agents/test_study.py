@@ -1,6 +1,5 @@
 """A study plays what its rows lack, reports, and loses nothing when it is killed."""
 
-import sys
 from dataclasses import replace
 
 import polars as pl
@@ -13,7 +12,7 @@ from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, 
 from dptse_env import versions
 from dptse_env.estimators.recurrent import read_weights
 from tests.agents.faults import SHORT, rows_of, study
-from tests.helpers import run_killed, save_untrained
+from tests.helpers import save_untrained
 
 KEYWORDS = {"estimator": "random_walk", "horizon": 80}
 
@@ -194,14 +193,4 @@ def test_pairs_are_of_equal_numbers(monkeypatch):
 def test_a_killed_worker_loses_nothing(tmp_path, traces, expected):
     run(study(), Place(tmp_path, make_executor("local", 2)))
     assert (traces / "killed").exists()
-    assert rows_of(tmp_path).equals(expected)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows kills otherwise")
-def test_a_killed_program_goes_on(tmp_path, expected):
-    words = "tests.agents.faults", tmp_path
-    assert run_killed("dptse_env.utils.progress:tqdm", "update", 2, *words).returncode == -9
-    assert len(list((tmp_path / "rows").glob("*.parquet"))) == 2
-    assert run_killed("dptse_env.utils.progress:tqdm", "update", 5, *words).returncode == 0
     assert rows_of(tmp_path).equals(expected)

@@ -4,7 +4,6 @@ import io
 import json
 import re
 import shlex
-import signal
 import sys
 
 import pytest
@@ -18,7 +17,7 @@ from agents.training.run import least
 from agents.training.run_files import read_progress
 from scripts import train
 from tests.agents.training.plans import SMALL, STEPS, without_time
-from tests.helpers import SHORT, run_killed
+from tests.helpers import SHORT
 from tests.scripts.commands import refused, run_command
 
 ENV = f'{SHORT} {{"horizon": 64}}'
@@ -88,25 +87,3 @@ def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
     assert next_step.endswith(shlex.join(["--policies", *best]))
     first, second = (without_time(read_progress(tmp_path / seed)) for seed in "01")
     assert first[-1]["validation"] != second[-1]["validation"]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals for a process")
-@pytest.mark.parametrize("how", [getattr(signal, "SIGKILL", None), signal.SIGINT])
-@pytest.mark.parametrize("algorithm", ["plackett-luce", "ppo"])
-def test_a_killed_program_goes_on(tmp_path, how, algorithm):
-    def start(output, n_checkpoints):
-        where = "agents.training.run_files:TrainingFolder", "keep", n_checkpoints
-        given = words(tmp_path / output, algorithm)
-        return run_killed(*where, "scripts.dptse", "train", *given, how=how)
-
-    done = start("killed", 1)
-    assert done.returncode == (130 if how == signal.SIGINT else -how), done.stderr
-    assert how == signal.SIGKILL or "the same command goes on" in done.stderr
-    curves = []
-    for run in ("killed", "whole"):
-        assert start(run, 1000).returncode == 0
-        curves.append(without_time(read_progress(tmp_path / run)))
-    assert [row["update"] for row in curves[0]] == [row["update"] for row in curves[1]]
-    if algorithm == "plackett-luce":
-        assert curves[0] == curves[1]

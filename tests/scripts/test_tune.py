@@ -1,14 +1,8 @@
 import json
-import sys
 
 import gymnasium as gym
-import optuna
-import pytest
 
-from agents.environments import make_config
-from agents.play import record
-from agents.search.tuning import n_finished
-from tests.helpers import SHORT, run_killed
+from tests.helpers import SHORT
 from tests.scripts.commands import refused, run_command
 
 TUNE = ("fit", "--tune", "--trials", "3", "--estimators", "random_walk")
@@ -56,24 +50,6 @@ def test_settings_are_tuned_on_a_road_of_ones_own(tmp_path):
     assert path.read_text() == ROAD
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows kills otherwise")
-def test_a_killed_run_leaves_nobody_behind_and_goes_on(tmp_path):
-    words = (
-        "scripts.dptse", "fit", "--tune", "--env", SHORT, "--estimators", "ekf",
-        "--train-seeds", "0:2", "--trials", "16", "--workers", "2", "--output", tmp_path,
-    )  # fmt: skip
-    journal = tmp_path / "trials.journal"
-    record(make_config(SHORT, {}).corridor, range(2))  # whose bar would count, too
-    assert run_killed("dptse_env.utils.progress:tqdm", "update", 4, *words).returncode == -9
-    n = finished(journal)
-    assert 4 <= n < 16
-    assert not (tmp_path / "ekf-published-printed.json").exists()
-    assert run_killed("dptse_env.utils.progress:tqdm", "update", 17 - n, *words).returncode == 0
-    (content,) = json.loads((tmp_path / "ekf-published-printed.json").read_text()).values()
-    assert content["provenance"]["n_trials"] == finished(journal) == 16
-
-
 def test_a_search_goes_on_after_ctrl_c_with_force_too(monkeypatch):
     def interrupt(_):
         raise KeyboardInterrupt
@@ -81,11 +57,3 @@ def test_a_search_goes_on_after_ctrl_c_with_force_too(monkeypatch):
     monkeypatch.setattr("scripts.fit.main", interrupt)
     said = run_command(*TUNE, "--env", SHORT, "--force").stderr
     assert "the same command goes on from what is done" in said
-
-
-def finished(journal):
-    """Count trials that were completed or stopped early."""
-    backend = optuna.storages.journal.JournalFileBackend(str(journal))
-    storage = optuna.storages.JournalStorage(backend)
-    (name,) = optuna.get_all_study_names(storage)
-    return n_finished(optuna.load_study(study_name=name, storage=storage))
