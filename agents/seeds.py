@@ -15,13 +15,14 @@ EVALUATION = range(1_000_000)
 TUNING = range(1_000_000, 2_000_000)
 """The search of estimator settings."""
 CHOICE = range(2_000_000, 3_000_000)
-"""The choice of parameters, estimator and query rule for a road, on validation traffic."""
+"""The choice of parameters, estimator and query rule for a road, and of the rule of a task of the
+query suite, on validation traffic."""
 TRAINING_VALIDATION = range(4_000_000, 5_000_000)
 """The learning curve of a training, by which its best policy is kept, and the rules beside it."""
 STUDY_TEST = range(6_000_000, 7_000_000)
 """The test results of the study of policies."""
 SUITE = range(7_000_000, 8_000_000)
-"""The cells of the query suite."""
+"""The tasks of the query suite."""
 TRAINING = range(10_000_000, 1_010_000_000)
 """Training episodes; see `training_seed`."""
 

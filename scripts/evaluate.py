@@ -5,9 +5,10 @@ dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --test-seeds 2000:2004 \
 
 Errors leave out the first 60 s of an episode. Differences are paired by traffic and noise.
 
-dptse evaluate --suite short --policies speed-front
+dptse evaluate --suite short-printed --policies speed-front
 
-An entry to the query suite gets a card. Of several policies the first that suits a cell acts.
+An entry to the query suite gets a card. Several policies are training seeds of one algorithm; a
+TOML file names policies by task.
 """
 
 from __future__ import annotations
@@ -23,19 +24,22 @@ import polars as pl
 
 from agents.environments import heading, make_config, parse_env, settings_of
 from agents.figures import RoadMap, draw_errors, draw_maps, estimate_map, save_figure
-from agents.files import write_json
 from agents.page import watch, write_page
 from agents.play import Cell
 from agents.policies import find_policy, policy_name
 from agents.seeds import seed_kind
 from agents.statistics import Interval, mean_interval
 from agents.studies import suite
+from agents.studies.suite import tasks as suite_tasks
+from agents.studies.suite.entries import CARD, begin, check, make_entry, read_entry
+from agents.studies.suite.tasks import NAME, ROUND_ROBIN
 from agents.study import OWN, ROWS, TABLES, Place, Study, play_study, remove_parts, write_tables
 from agents.tables import (
     DENSITY,
     ERROR,
     HONESTY,
     SPEED,
+    UnmeasuredError,
     are_present,
     below,
     error_label,
@@ -43,13 +47,13 @@ from agents.tables import (
     values,
 )
 from agents.terminal import make_table
-from dptse_env.config import parse_seeds
+from dptse_env.config import MOST_SEEDS, parse_seeds
 from dptse_env.evaluation import WARM_UP
 from dptse_env.policies import DETERMINISTIC
 from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import require_output
-from dptse_env.utils.validation import integer, require, require_name
+from dptse_env.utils.validation import integer, read_json, require, require_name
 from scripts.cli import (
     Command,
     Environment,
@@ -66,8 +70,8 @@ ALL = "all"
 """The schedule that runs with a bandwidth that covers the road."""
 
 METRICS = (ERROR, DENSITY, SPEED)
-ERRORS, MAPS, PAGE, CARD = "errors.png", "space_time.png", "page.html", "card.json"
-"""Files of the figures, of the interactive page, and of an entry to the suite."""
+ERRORS, MAPS, PAGE = "errors.png", "space_time.png", "page.html"
+"""Files of the figures and of the interactive page."""
 OUTPUT = Path("results/evaluation")
 
 
@@ -94,9 +98,13 @@ class Args(
     html: bool = False
     """Also write an interactive page, page.html."""
     suite: tuple[str, ...] | None = None
-    """Play cells of the query suite; all if none is named."""
+    """Play tasks of the query suite; all if none is named."""
+    fresh: int | None = None
+    """Play so many traffic seeds drawn at this call, in place of the suite's."""
     beside: tuple[Path, ...] = ()
     """Cards of other entries to the suite."""
+    replay: int | None = None
+    """First play the cards beside again: so many training seeds, drawn in each task."""
     output: Path = OUTPUT
     """Folder of the results; results/my-suite/NAME for an entry to the suite."""
 
@@ -104,12 +112,12 @@ class Args(
 def main(args: Args) -> None:
     """Compare policies, or let them enter the suite."""
     if args.suite is None:
-        args.require_unset("without --suite", "beside")
+        args.require_unset("without --suite", "fresh", "beside", "replay")
         compare(args)
     else:
         rest = "env", "estimators", "test_seeds", "seed", "reference", "acts", "transfer", "html"
         args.require_unset("with --suite", *rest, "force")
-        enter(args, args.suite or tuple(suite.CELLS))
+        enter(args, args.suite or tuple(suite_tasks.TASKS))
 
 
 def play(name: str, cells: tuple[Cell, ...], seeds: tuple[int, ...], place: Place) -> pl.DataFrame:
@@ -378,28 +386,47 @@ def draw_traffic(args: Args, title: str, scores: Sequence[Score], cells: Sequenc
 # The suite.
 
 
-def enter(args: Args, names: Sequence[str]) -> None:
-    """Play what was entered in cells of the suite, write its card, and print scores."""
+def enter(args: Args, tasks: Sequence[str]) -> None:
+    """Play what was entered in tasks of the suite, write its card, and print errors and scores."""
     require(bool(args.policies), "policies", "given with --suite", args.policies)
-    others = [suite.read_card(path) for path in args.beside]
-    for name in names:
-        require_name("suite", name, list(suite.CELLS))
-    cells, left_out = suite.enter(args.policies, names)
-    entry = str(cells[0].labels["policy"])
+    for name in tasks:
+        require_name("suite", name, list(suite_tasks.TASKS))
+    tasks = [name for name in suite_tasks.TASKS if name in tasks]
+    fresh = None if args.fresh is None else integer("fresh", args.fresh, 2, MOST_SEEDS)
+    draws = None if args.replay is None else integer("replay", args.replay, 1)
+    require(draws is None or bool(args.beside), "replay", "given with cards beside", draws)
+    rules, rows = suite.recorded()
+    others = []
+    for path in args.beside:
+        try:
+            others.append(suite.read(path, rules, rows)[1])
+        except UnmeasuredError as problem:
+            allowed = f"an entry with rows of these numbers; those of {problem} are missing"
+            raise ValueError(f"beside must be {allowed}, got {path}") from problem
+        fits = fresh is None and read_entry(path).fresh is None and list(others[-1].errors) == tasks
+        require(fits, "beside", "cards of the same tasks, on the traffic of the suite", str(path))
+    entry = make_entry(args.policies, tasks)
     # A schedule by "module:Class" has a character that not every system allows in a path.
-    own_folder = Path("results/my-suite") / entry.replace(":", "-")
+    own_folder = Path("results/my-suite") / entry.name.replace(":", "-")
     folder = own_folder if args.output == OUTPUT else args.output
-    require_output(folder, own=OWN)
-    place, recorded = args.place(folder), suite.recorded_rows()
-    if left_out:
-        args.remark(left_out)
-    # The folder may have rows of this policy under another name.
-    own = play("suite", cells, suite.SEEDS, place).with_columns(policy=pl.lit(entry))
-    rows: pl.DataFrame = pl.concat([recorded, *others, own], how="diagonal_relaxed")
-    rows = rows.unique(("policy", "name", "traffic_seed"), keep="last")
-    card = suite.make_card(rows, entry, cells)
-    write_json(folder / CARD, card)
-    shown = [entry, *(each["policy"][0] for each in others)]
-    header, lines = suite.beside_rules(rows, shown)
-    title = f"{suite.NAME}, from second {WARM_UP + 1} on: {suite.ZERO} has 0, {suite.ONE} has 1"
-    args.answer(card, make_table(title, *header, rows=lines), f"the card is {folder / CARD}")
+    require_output(folder, own=() if fresh else OWN)  # drawn traffic is drawn at this call
+    place = args.place(folder)
+    for path in args.beside if draws else ():
+        assert draws is not None
+        largest = check(path, draws, args.records)
+        args.remark(f"{path}: what was played again is as it says, to {100 * largest:.2g} %")
+    for task, why in entry.left.items():
+        args.remark(f"{entry.name} does not suit {task}, where {ROUND_ROBIN} acts: {why}")
+    entry = begin(entry, folder, fresh, args.records)
+    own = play("suite", tuple(entry.cells(rules)), (), place)
+    schedule, line = suite.read(folder / CARD, rules, rows)
+    header, lines = suite.compare([schedule, line, *others], rules)
+    reads = "" if entry.reads == "observations" else f", reads the {entry.reads}"
+    title = (
+        f"{NAME}, errors x 1000 from second {WARM_UP + 1} on: {entry.name} ({entry.track}{reads})"
+    )
+    write_tables(folder, f"# {title}\n\n{markdown(header, lines)}", own)
+    below = {"mean": line.scores.mean, **line.scores.tasks}
+    scores = {name: each and dataclasses.asdict(each) for name, each in below.items()}
+    content = {**read_json(folder / CARD), "below_the_best_rule": scores}
+    args.answer(content, make_table(title, *header, rows=lines), f"the card is {folder / CARD}")

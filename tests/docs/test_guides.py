@@ -31,7 +31,7 @@ GUIDES = {
     "train-a-policy.md": {
         "--minutes 8": "--steps 8192 --train-seeds 0:2 --validation-seeds 1000:1002",
         "--test-seeds 2000:2032": "--test-seeds 2000:2002 --workers 1",
-        "dptse evaluate --suite --policies": "dptse evaluate --suite short --policies",
+        "dptse evaluate --suite --policies": "dptse evaluate --suite short-printed --policies",
         '"0:64"': '"0:2"',
         "1_000_000": "8192",
         'num_envs=8, traffic_seeds="2000:2008"': 'num_envs=2, traffic_seeds="2000:2002"',
@@ -39,6 +39,10 @@ GUIDES = {
         'gym.make(id, traffic_seeds="2000:2008"': 'gym.make(id, traffic_seeds="2000:2002"',
         "n_eval_episodes=8": "n_eval_episodes=2",
         " / 8 for": " / 2 for",
+    },
+    "compare-policies.md": {
+        "--fresh 8": "--fresh 2 --workers 1",
+        "--test-seeds 1000:1064": "--test-seeds 1000:1002 --workers 1",
     },
     "your-road.md": {
         "dptse fit my-road.toml": f"dptse fit my-road.toml {FIT} {SEEDS}",
@@ -116,6 +120,14 @@ def need(module: str) -> None:
 
 
 @pytest.mark.slow
+def test_entries_are_compared_checked_and_played_on_fresh_traffic(run_guide):
+    printed, _ = run_guide("compare-policies.md")
+    assert "query-suite-v4, errors x 1000 from second 61 on" in printed
+    card = json.loads(Path("results/fresh/card.json").read_text())
+    assert len(card["fresh"]) == 2
+
+
+@pytest.mark.slow
 def test_a_policy_is_trained_compared_and_entered_in_the_suite(run_guide):
     need("stable_baselines3")
     printed, names = run_guide("train-a-policy.md")
@@ -123,7 +135,7 @@ def test_a_policy_is_trained_compared_and_entered_in_the_suite(run_guide):
     assert all(Path(name).is_file() for name in ("mine/curve.png", "mine/test/space_time.png"))
     for name in ("mine/best", "mynet-Net"):
         card = json.loads(Path("results/my-suite", name, "card.json").read_text())
-        assert card["scores"].keys() == {"short"}
+        assert card["policies"].keys() == {"short-printed"}
     observation = names["envs"].reset(seed=0)[0]
     loaded, imported = (
         names["load_policy"](file, names["unseen"]).predict(observation, deterministic=True)[0]

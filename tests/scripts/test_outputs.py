@@ -32,7 +32,7 @@ COMMANDS = {
     "fit --tune": (
         ["--env", SHORT, "--estimators", "random_walk"], "random_walk-published-printed.json",
     ),
-    "evaluate --suite short": (["--policies", "speed-front", *ONE], "card.json"),
+    "evaluate --suite short-printed": (["--policies", "speed-front", *ONE], "card.json"),
     "study": (["examples.my_study:STUDY", *ONE], "tables.md"),
     "fit": (["road.toml", *ONE], "fit.md"),
     "audit": (["--env", SHORT, *ONE], "audit.json"),
@@ -106,7 +106,7 @@ def test_a_place_where_results_cannot_go_is_refused_before_any_work(name, tmp_pa
         mine = taken / kept
         mine.mkdir(parents=True)
         offered = run_command(*name.split(), "-h").stdout
-        takes_force = "--force" in offered and name not in ("fit", "evaluate --suite short")
+        takes_force = "--force" in offered and name not in ("fit", "evaluate --suite short-printed")
         force = ["--force"] if takes_force else []
         assert str(mine) in refused(*given(taken), *force)  # which removes no folder
         mine.rmdir()
