@@ -267,7 +267,6 @@ def run(
     *,
     program: str | None = None,
     words: Sequence[str] | None = None,
-    renamed: Mapping[str, str] | None = None,
     resumes: bool = True,
 ) -> None:
     """Parse the command line into ``arguments`` and call ``main`` with them.
@@ -283,12 +282,11 @@ def run(
         description: Text for ``--help``: a sentence, and an example in a paragraph of its own.
         program: Name of the program in its help; that of the file if None.
         words: The command line; that of the process if None.
-        renamed: What has the place of options that there were, by their names.
         resumes: Whether the program goes on from what an interrupted run has done.
     """
     logging.basicConfig(format="%(message)s")
     try:
-        given = parse(arguments, description, program, words, renamed or {})
+        given = parse(arguments, description, program, words)
         is_quiet = getattr(given, "quiet", False)
         with (
             _said(not is_quiet),
@@ -325,9 +323,8 @@ def _said(is_said: bool) -> Iterator[None]:
 
 
 def parse(
-    arguments: Any, description: str | None, program: str | None, words: Sequence[str] | None,
-    renamed: Mapping[str, str],
-) -> Any:  # fmt: skip
+    arguments: Any, description: str | None, program: str | None, words: Sequence[str] | None
+) -> Any:
     """Return the arguments that a command line gives; see `run`.
 
     Raises:
@@ -335,10 +332,6 @@ def parse(
         SystemExit: It asked for help, which is printed.
     """
     words = sys.argv[1:] if words is None else words
-    for word in words:
-        option = word.partition("=")[0].replace("_", "-")
-        if option in renamed:
-            raise ValueError(f"{option} is {renamed[option]} now")
     boxes, folded = io.StringIO(), cast(TextIO, _Folded(sys.stdout))
     try:
         with contextlib.redirect_stdout(folded), contextlib.redirect_stderr(boxes):

@@ -32,58 +32,6 @@ GROUPS = {
 ANEW = ("audit", "import", "info")
 """Commands that begin anew after an interruption, as evaluate does with --force."""
 
-GONE = {
-    "suite": "evaluate --suite",
-    "tune": "fit --tune",
-    "policy": "import policy",
-    "replay-field": "import field and dptse evaluate",
-}
-"""Successors of commands that there were."""
-
-RENAMED: dict[str, dict[str, str]] = {
-    "audit": {"--runs": "--trials"},
-    "evaluate": {
-        "--schedules": "--policies",
-        "--seeds": "--test-seeds",
-        "--noise-seed": "--seed",
-    },
-    "fit": {
-        "--training": "--train-seeds",
-        "--validation": "--validation-seeds",
-        "--test": "--test-seeds",
-        "--tries": "--trials",
-        "--rules": "--policies",
-        "--seeds": "--train-seeds",
-        "--schedule": "--policies",
-        "--variant": "the name that you give the file",
-    },
-    "import": {
-        "--keywords": "part of --env, 'ID {JSON}'",
-        "--name": "the name of the folder of --output",
-    },
-    "info": {"--mu": "dptse_env.privacy.over_trips, a function,"},
-    "record": {"--seeds": "--train-seeds, --validation-seeds or --test-seeds"},
-    "study": {
-        "--quick": "--test-seeds 2000:2003",
-        "--seeds": "--test-seeds",
-        "--train": """part of the name, 'policies {"minutes": 1}'""",
-        "--training-seeds": """part of the name, 'policies {"minutes": 1, "seeds": "0:5"}'""",
-        "--weights": """part of the name, 'roads {"weights": ["mine"]}'""",
-    },
-    "train": {
-        "--seeds": "--seed",
-        "--traffic": "--train-seeds",
-        "--validation": "--validation-seeds",
-        "--keywords": "part of --env, 'ID {JSON}'",
-    },
-    "train-estimator": {
-        "--seeds": "--seed",
-        "--traffic": "--train-seeds",
-        "--validation": "--validation-seeds",
-    },
-}
-"""Successors of options that there were, by command."""
-
 MODULES = {name: f"scripts.{name.replace('-', '_')}" for group in GROUPS.values() for name in group}
 MODULES["import"] = "scripts.imports"
 
@@ -104,14 +52,10 @@ def main(words: Sequence[str]) -> None:
         program = f"dptse {name}"
         # A search of settings goes on with its trials all the same.
         resumes = name not in ANEW and (name == "fit" or "--force" not in rest)
-        run(
-            module.main, module.Args, module.__doc__, program=program, words=rest,
-            renamed=RENAMED[name], resumes=resumes,
-        )  # fmt: skip
+        run(module.main, module.Args, module.__doc__, program=program, words=rest, resumes=resumes)
     else:
         known = ", ".join(MODULES)
-        said = f"is dptse {GONE[name]} now" if name in GONE else f"is no command; there are {known}"
-        print(f"error: {name!r} {said}", file=sys.stderr)
+        print(f"error: {name!r} is no command; there are {known}", file=sys.stderr)
         raise SystemExit(2)
 
 

@@ -7,8 +7,7 @@ Errors leave out the first 60 s of an episode. Differences are paired by traffic
 
 dptse evaluate --suite short-printed --policies speed-front
 
-An entry to the query suite gets a card. Several policies are training seeds of one algorithm; a
-TOML file names policies by task.
+An entry to the query suite gets a card. Several policies are training seeds; TOML names tasks.
 """
 
 from __future__ import annotations
@@ -100,11 +99,11 @@ class Args(
     suite: tuple[str, ...] | None = None
     """Play tasks of the query suite; all if none is named."""
     fresh: int | None = None
-    """Play so many traffic seeds drawn at this call, in place of the suite's."""
+    """Play so many traffic seeds that are drawn at this call."""
     beside: tuple[Path, ...] = ()
     """Cards of other entries to the suite."""
     replay: int | None = None
-    """First play the cards beside again: so many training seeds, drawn in each task."""
+    """First play so many training seeds of these cards again."""
     output: Path = OUTPUT
     """Folder of the results; results/my-suite/NAME for an entry to the suite."""
 

@@ -25,7 +25,7 @@ from dptse_env.traffic import RecordingError
 from dptse_env.utils.registry import EXTRAS
 from dptse_env.versions import code_version
 from scripts import dptse, info
-from scripts.dptse import GONE, MODULES, RENAMED
+from scripts.dptse import MODULES
 from tests.helpers import ROOT, SHORT, fast_and_slow, save_untrained
 from tests.importers.data import plain, stream
 from tests.importers.sumo_net.conftest import motorway
@@ -107,27 +107,6 @@ def test_help_on_a_command_is_that_of_the_command():
     assert run_command("help", "record").stdout == run_command("record", "--help").stdout
     words = "import", "field"
     assert run_command("help", *words).stdout == run_command(*words, "--help").stdout
-
-
-@pytest.mark.parametrize("name", GONE)
-def test_what_has_the_place_of_a_command_is_told(name):
-    new = GONE[name]
-    assert new in refused(name, "--help")
-    assert new.split()[0] in MODULES
-
-
-OLD = [(name, old) for name, options in RENAMED.items() for old in options]
-
-
-@pytest.mark.parametrize(("name", "old"), OLD)
-def test_what_has_the_place_of_an_option_is_told(name, old):
-    new = RENAMED[name][old]
-    assert f"{old} is {new} now" in refused(name, f"{old}=1")
-    kinds = KINDS if name == "import" else [""]
-    pages = "".join(help_of(f"{name} {kind}") for kind in kinds)
-    offered = re.findall(r"--[a-z-]+", pages)
-    assert old not in offered
-    assert {*re.findall(r"--[a-z-]+", new)} <= {*offered}
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])

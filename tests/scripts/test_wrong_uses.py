@@ -52,7 +52,7 @@ USES = {
         "--workers x": "--workers",
         "--workers": "--workers",
         "--env SHORT": "--train-seeds … --validation-seeds … --test-seeds",
-        "--env SHORT --seeds 0:4": "--train-seeds … --validation-seeds … --test-seeds",
+        "--env SHORT --seeds 0:4": "--seeds",
         "--env SHORT --train-seeds 0:2 --validation-seeds 0:4":
             "validation_seeds must be … 1000..1999 … 0",
         "--train-seeds 3:1": "train_seeds must be … 3:1",
