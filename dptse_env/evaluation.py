@@ -84,7 +84,8 @@ def evaluate(
             object with ``predict``, such as a model of stable-baselines3, or a function of the
             observation. A vector environment gives it a batch of observations, (n, size).
         seeds: Traffic seeds, one or more.
-        noise_seed: Noise and estimator are seeded with this plus the traffic seed.
+        noise_seed: Noise and estimator are seeded with this plus the traffic seed, and the choices
+            of a schedule that draws with this alone.
         warm_up: Seconds at the start of an episode that do not count [s].
         deterministic: Whether the policy is asked for its likeliest action; None for what it says
             itself, a saved one by its card, and for the likeliest of one that says nothing.
@@ -125,7 +126,7 @@ def evaluate(
     allowed = f"among the environment's traffic_seeds ({remedy})"
     require(not unknown, "seeds", allowed, unknown)
     require(config.horizon_steps > warm_up, "warm_up", "shorter than an episode", warm_up)
-    player = make_schedule(policy, bare)
+    player = make_schedule(policy, bare, noise_seed)
     if deterministic is None:
         deterministic = getattr(player, "deterministic", True)
     rows: list[Row] = []

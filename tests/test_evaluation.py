@@ -150,6 +150,15 @@ def test_errors_are_pooled_over_segments_and_seconds():
     assert row["rmse_speed"] == pytest.approx(expected_speed)
 
 
+def test_a_schedule_that_draws_chooses_the_same_with_the_same_noise_seed():
+    given = {"num_envs": 2, "traffic_seeds": [2000, 2001]}
+    first, same, other = (
+        evaluate(gym.make_vec(SHORT, **given), "random", [2000, 2001], seed) for seed in (3, 3, 4)
+    )
+    assert first == same
+    assert first != other
+
+
 def test_a_seed_gives_the_same_noise_under_every_policy_and_another_with_a_noise_seed():
     released = []
     for name, noise in (("static", 0), ("random", 0), ("static", 1)):

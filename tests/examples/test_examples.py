@@ -64,7 +64,7 @@ def test_the_demo_ends_with_four_bars_and_a_sentence(tmp_path):
 def test_a_schedule_of_ones_own():
     printed = run("examples/my_schedule.py")
     errors = dict(re.findall(r"(\S+) +error x 1000: (\S+)", printed))
-    assert float(errors["DenseAndOld"]) < float(errors["shift-ahead"])
+    assert float(errors["UncertainAndOld"]) < float(errors["shift-ahead"])
 
 
 def test_a_study_of_ones_own(tmp_path):
