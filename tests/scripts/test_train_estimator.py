@@ -36,6 +36,7 @@ def arguments(output, *more):
     return tyro.cli(Args, args=["--output", str(output), *SMALL, *more])
 
 
+@pytest.mark.slow
 def test_it_trains_a_pair_that_an_environment_takes(tmp_path, capsys):
     train_estimator.main(arguments(tmp_path))
     printed = capsys.readouterr().out

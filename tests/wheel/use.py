@@ -45,7 +45,7 @@ def main() -> None:
 def use_parts_of_another_package() -> None:
     """Run with a part of every kind, by names that the entry point of their package registers."""
     kinds = ("action", "corridor", "estimator", "privacy", "reward")
-    keywords = {kind: f"plugin-{kind}" for kind in kinds}
+    keywords = {kind: f"plugin-{kind}" for kind in kinds} | {"bandwidth": 2}
     keywords["observation"] = ["default", "plugin-observation"]
     env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords)
     env.reset(seed=0)
