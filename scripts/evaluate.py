@@ -30,7 +30,7 @@ from agents.seeds import seed_kind
 from agents.statistics import Interval, mean_interval
 from agents.studies import suite
 from agents.studies.suite import tasks as suite_tasks
-from agents.studies.suite.entries import CARD, begin, check, make_entry, read_entry
+from agents.studies.suite.entries import CARD, begin, check, make_entry
 from agents.studies.suite.tasks import NAME, ROUND_ROBIN
 from agents.study import OWN, ROWS, TABLES, Place, Study, play_study, remove_parts, write_tables
 from agents.tables import (
@@ -398,22 +398,24 @@ def enter(args: Args, tasks: Sequence[str]) -> None:
     others = []
     for path in args.beside:
         try:
-            others.append(suite.read(path, rules, rows)[1])
+            other = suite.read(path, rules, rows)[1]
         except UnmeasuredError as problem:
             allowed = f"an entry with rows of these numbers; those of {problem} are missing"
             raise ValueError(f"beside must be {allowed}, got {path}") from problem
-        fits = fresh is None and read_entry(path).fresh is None and list(others[-1].errors) == tasks
+        on_fresh = fresh is not None or (other.entry is not None and other.entry.fresh is not None)
+        fits = not on_fresh and list(other.errors) == tasks
         require(fits, "beside", "cards of the same tasks, on the traffic of the suite", str(path))
+        others.append(other)
     entry = make_entry(args.policies, tasks)
     # A schedule by "module:Class" has a character that not every system allows in a path.
     own_folder = Path("results/my-suite") / entry.name.replace(":", "-")
     folder = own_folder if args.output == OUTPUT else args.output
     require_output(folder, own=() if fresh else OWN)  # drawn traffic is drawn at this call
     place = args.place(folder)
-    for path in args.beside if draws else ():
-        assert draws is not None
-        largest = check(path, draws, args.records)
-        args.remark(f"{path}: what was played again is as it says, to {100 * largest:.2g} %")
+    if draws is not None:
+        for path in args.beside:
+            largest = check(path, draws, args.records)
+            args.remark(f"{path}: what was played again is as it says, to {100 * largest:.2g} %")
     for task, why in entry.left.items():
         args.remark(f"{entry.name} does not suit {task}, where {ROUND_ROBIN} acts: {why}")
     entry = begin(entry, folder, fresh, args.records)

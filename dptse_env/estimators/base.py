@@ -40,6 +40,8 @@ Played = Mapping[str, Sequence[float]]
     [km/h].
 ``headway``
     Desired time headways of drivers [s], where they are given.
+``own_parameters``
+    1 where the ARZ parameters are the road's own, 0 where they are a shipped set.
 """
 
 

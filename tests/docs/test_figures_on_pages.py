@@ -46,7 +46,7 @@ def sections(text):
 
 
 def is_among(interval, places, table):
-    """Whether a table has an interval to within rounding, as it is or as a difference turned."""
+    """Return whether a table has an interval to within rounding, with either sign."""
     room = 0.51 * 10.0**-places + 1e-9
     mean, low, high = interval
     turned = [-mean, -high, -low]

@@ -157,7 +157,7 @@ USES = {
         "--env SHORT --output my-road.toml": "output must be … my-road.toml",
     },
 }  # fmt: skip
-"""What begins a line of ``dptse``: what else it has, and what the error names."""
+"""By the beginning of a line of ``dptse`` its other words, with what the error names."""
 
 ENVIRONMENTS = {
     "dptse_env:dptse/Nowhere-v0": "env must be",

@@ -1,4 +1,4 @@
-"""What a query policy reads: found out by playing it, whatever it says of itself."""
+"""Finds out by playing it what a query policy reads, whatever the policy says of itself."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from dptse_env.evaluation import evaluate
 from dptse_env.traffic import Records
 
 Access = Literal["observations", "process", "truth"]
-"""What a policy reads beside nothing: observations alone; the state of the process, such as the
-estimator's covariance; the true traffic. The last of several counts."""
+"""Objects that a policy reads: observations alone; the state of the process, such as the covariance
+of the estimator; the true traffic. The last of several counts."""
 
 HARMLESS = {"interface", "config", "n_episodes"}
 """Attributes of a process that tell nothing of its state."""
