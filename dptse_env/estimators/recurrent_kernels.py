@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from dptse_env.estimators.base import Measurement
 from dptse_env.model import ARZ, ARZModel
-from dptse_env.model.step import clip
+from dptse_env.model.step import clip, pressure
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.kernels import Bundle, all_finite, inline_part, kernel, kernel_part
 
@@ -271,10 +271,9 @@ def read(bundle: Bundle, episodes: IntArray, measured: Measurement, x: Float32Ar
 
 @kernel_part
 def _equilibrium_speed(arz: ARZ, s: int, density: float) -> float:
-    """Return V_e = v_f (1 - (rho / rho_m)^gamma), at which traffic of a density settles."""
-    share = min(max(density, 0.0) / arz.jam[s], 1.0)
-    speed: float = arz.free_flow_speed * (1.0 - share**arz.gamma)
-    return speed
+    """Return V_e = v_f - p(rho), at which traffic of a density settles, 0 in a jam."""
+    v_f = arz.free_flow_speed
+    return max(v_f - pressure(density, arz.jam[s], v_f, arz.gamma), 0.0)
 
 
 @inline_part
