@@ -135,6 +135,11 @@ def test_the_paper_has_its_sections_and_cites_what_its_bibliography_has():
     assert 750 <= len(text.split()) <= 1_100
     keys = re.findall(r"^@\w+\{(\w+),$", bibliography, re.MULTILINE)
     assert sorted(keys) == sorted(set(re.findall(r"@(\w+)", text)))
+    entries = re.split(r"^@\w+", bibliography, flags=re.MULTILINE)[1:]
+    address = re.compile(r"^  (doi = \{10\.\d{4,}/\S+|url = \{http\S+)\},?$", re.MULTILINE)
+    # One conference paper has an identifier that we could not verify.
+    assert [each[1:12] for each in entries if not address.search(each)] == ["andre2017en"]
+    assert all(each.count("{") == each.count("}") for each in entries)
     authors = citation.partition("\nreferences:")[0].partition("\nauthors:")[2]
     names = re.findall(r"- name: (.*)", authors)
     assert names
