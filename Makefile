@@ -32,7 +32,6 @@ reproduce: setup  ## Write the reports of all studies anew, after playing what t
 	$(BIN)/dptse study guarantees
 	$(BIN)/dptse study estimators
 	$(BIN)/dptse study roads
-	$(BIN)/dptse study policies
 	$(BIN)/dptse study suite
 
 CAPPED = --env 'dptse_env:dptse/PrivateHighway-v1 {"estimator": "ekf", "bandwidth": 5, "privacy": "capped"}'

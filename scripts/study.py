@@ -32,7 +32,6 @@ STUDIES = {
     "guarantees": "agents.studies.guarantees:STUDY",
     "estimators": "agents.studies.estimators:STUDY",
     "roads": "agents.studies.roads:study",
-    "policies": "agents.studies.policies:study",
     "suite": "agents.studies.suite:STUDY",
 }
 RESULTS = Path("results")
@@ -43,9 +42,8 @@ class Args(Command, Machines, TestSeeds, Environments):
     """Play a study and write its report."""
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """paper, guarantees, estimators, roads, policies, suite, or your own "module:NAME"; with
-    keywords as JSON, 'policies {"minutes": 1, "seeds": "0:5"}' trains for so long with so many
-    seeds first, 'roads {"weights": ["my-weights"]}' plays weights of your own."""
+    """paper, guarantees, estimators, roads, suite, or your own "module:NAME"; with keywords as
+    JSON, 'roads {"weights": ["my-weights"]}' plays weights of your own."""
     report: bool = False
     """Write tables and figures of the rows that are there, and play nothing."""
     env: tuple[str, ...] = ()

@@ -6,6 +6,7 @@ import polars as pl
 import pytest
 
 from agents.executors import this_process
+from agents.studies.suite import RECORDED
 from agents.study import Place, read_rows
 from dptse_env.config import VALIDATION_SEEDS
 from examples.my_study import STUDY
@@ -58,8 +59,9 @@ def test_seeds_and_environments_can_be_others_with_an_output_of_their_own():
 
 
 def test_choices_keep_their_validation_traffic_on_other_seeds(tmp_path):
-    study = find_study(Args(name="policies", test_seeds="2900:2902"))
-    cells = [*study.cells, *study.follow(pl.DataFrame(), Place(tmp_path, this_process))]
+    study = find_study(Args(name="suite", test_seeds="2900:2902"))
+    rows = read_rows("suite", RECORDED)
+    cells = [*study.cells, *study.follow(rows, Place(tmp_path, this_process))]
     seeds = {cell.labels["part"]: study.seeds_of(cell) for cell in cells}
     assert seeds["test"] == (2900, 2901)
     assert set(seeds["validation"]) <= set(VALIDATION_SEEDS)

@@ -111,9 +111,6 @@ USES = {
         "'roads 3'": "study must be … '3'",
         "tests.scripts.test_study:numbered": "numbered takes number: missing",
         """'tests.scripts.test_study:numbered {"number": 0}'""": "must be a Study, got int",
-        """'policies {"minutes": 0}'""": "minutes must be … 0",
-        """'policies {"minutes": 1, "seeds": 3}'""": "seeds must be … 3",
-        """'policies {"seeds": "0:2"}'""": "seeds must be left out without minutes",
         "examples.my_study:STUDY --test-seeds all": "test_seeds must be … 'all'",
         "examples.my_study:STUDY --env dptse_env:dptse/ShortHighway-v0 --report --quiet": (
             "env must be left out"
