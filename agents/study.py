@@ -25,7 +25,7 @@ import polars as pl
 
 from agents.executors import Executor, run_shown, this_process
 from agents.play import Cell, play, record
-from agents.tables import are_present, numbers
+from agents.tables import are_present, narrow, numbers
 from dptse_env.evaluation import WARM_UP
 from dptse_env.traffic import Records
 from dptse_env.utils.files import write_atomically
@@ -134,7 +134,7 @@ def write_report(study: Study, folder: Path) -> None:
     rows = read_rows(study.name, folder)
     if rows.is_empty():
         raise FileNotFoundError(f"{folder / ROWS} is not there: run the study without --report")
-    write_tables(folder, study.report(rows, folder).strip(), rows)
+    write_tables(folder, narrow(study.report(rows, folder).strip()), rows)
 
 
 def write_tables(folder: Path, content: str, rows: pl.DataFrame) -> None:

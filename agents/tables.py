@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -161,6 +162,28 @@ def markdown(
     """Return a Markdown table, its first column and the rest with the given rules below them."""
     lines = [header, [first, *[rest] * (len(header) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+WIDEST = 6
+"""Columns that a page has room for."""
+
+
+def narrow(text: str) -> str:
+    """Return a Markdown text with wide tables cut into some of `WIDEST` columns at most.
+
+    They share the first column.
+    """
+    parts = []
+    for part in text.split("\n\n"):
+        lines = [line[2:-2].split(" | ") for line in part.split("\n")]
+        n = len(lines[0])
+        if part.startswith("| ") and n > WIDEST:
+            cuts = np.array_split(np.arange(1, n), math.ceil((n - 1) / (WIDEST - 1)))
+            tables = ([[line[0], *(line[i] for i in cut)] for line in lines] for cut in cuts)
+            parts += [markdown(head, rows, *rule[:2]) for head, rule, *rows in tables]
+        else:
+            parts.append(part)
+    return "\n\n".join(parts)
 
 
 def grid(

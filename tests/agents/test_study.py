@@ -8,7 +8,16 @@ import pytest
 from agents.executors import make_executor, this_process
 from agents.play import Cell, play
 from agents.study import Place, Study, read_rows, run, write_report, write_table
-from agents.tables import UnmeasuredError, below, difference, grid, mean, pick, values
+from agents.tables import (
+    UnmeasuredError,
+    below,
+    difference,
+    grid,
+    mean,
+    narrow,
+    pick,
+    values,
+)
 from dptse_env import versions
 from dptse_env.estimators.recurrent import read_weights
 from tests.agents.faults import SHORT, rows_of, study
@@ -161,6 +170,18 @@ def test_an_id_says_all_that_rows_depend_on(tmp_path):
     # Weights of the package by their own name go with their digest.
     keywords = {"estimator_settings": {"recurrent": {"weights": "highway-flows"}}}
     assert read_weights("highway-flows").card["sha256"] in replace(first, keywords=keywords).id
+
+
+def test_wide_tables_are_cut_and_share_their_first_column():
+    wide = grid("", ["a", "b"], list("tuvwxyz"), lambda row, at: f"{row}{at}" if row == "a" else "")
+    first, second = narrow(wide).split("\n\n")
+    assert first.splitlines()[::2] == ["|  | t | u | v | w |", "| a | at | au | av | aw |"]
+    assert second.splitlines()[0] == "|  | x | y | z |"
+    assert second.splitlines()[1:] == [
+        "| --- | :-: | :-: | :-: |", "| a | ax | ay | az |", "| b |  |  |  |"
+    ]  # fmt: skip
+    text = "# A\n\n" + grid("", ["a"], list("vwxyz"), lambda *at: "1") + "\n\nMore."
+    assert narrow(text) == text
 
 
 def test_pairs_are_of_equal_numbers(monkeypatch):
