@@ -13,7 +13,7 @@ from agents.executors import this_process
 from agents.study import Place, read_rows, write_report
 
 RESULTS = Path(__file__).parents[3] / "results"
-NAMES = ["estimators", "guarantees", "paper", "policies", "roads", "suite"]
+NAMES = ["estimators", "guarantees", "paper", "roads", "suite"]
 
 pytestmark = pytest.mark.skipif(not RESULTS.is_dir(), reason="a source archive has no results")
 
