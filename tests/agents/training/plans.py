@@ -2,8 +2,6 @@
 
 import contextlib
 import json
-import os
-import signal
 
 from agents.training.plan import TrainingPlan
 from agents.training.run_files import TrainingFolder
@@ -87,7 +85,3 @@ def ended_at(update, how):
 
 def stop():
     raise StopError
-
-
-def kill():
-    os.kill(os.getpid(), signal.SIGKILL)

@@ -71,7 +71,7 @@ def test_the_bonus_for_age_is_added_once_after_any_number_of_rounds():
 def test_squared_errors_are_those_of_density_and_speed_in_units_of_their_scales():
     env = gym.make(SHORT, traffic_seeds="0:2", truth_in_info=True)
     observation, _ = env.reset(seed=0)
-    for _ in range(50):
+    for _ in range(20):  # the last segments are empty yet
         observation, *_, info = env.step(np.eye(2, 6, dtype=np.int8).sum(axis=0))
     density, speed = (info[f"true_{name}"][:6] for name in ("density", "speed"))
     squared = squared_errors(env.unwrapped.process)
@@ -79,7 +79,7 @@ def test_squared_errors_are_those_of_density_and_speed_in_units_of_their_scales(
     estimated = [block(observation, name)[:6] for name in ("density", "speed")]
     corridor, occupied = env.unwrapped.config.corridor, density > 0
     expected = (estimated[0] - density / corridor.scales.density_scale) ** 2
-    assert occupied.any()
+    assert 0 < occupied.sum() < 6
     expected += occupied * (estimated[1] - speed / corridor.scales.speed_scale) ** 2
     np.testing.assert_allclose(squared[0], expected, rtol=1e-4, atol=1e-8)
     assert squared.shape == (1, 6)

@@ -46,16 +46,15 @@ def test_settings_that_are_given_replace_single_ones():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a2c", "algorithm must be one of ppo, maskable-ppo, .*, plackett-luce, got 'a2c'"),
+        ("a2c", "algorithm must be one of .*'a2c'"),
         ("ppo {", "algorithm must be JSON"),
         ('ppo {"gama": 0.9}', "algorithm.gama is unknown"),
-        ('dqn {"gamma": 1.0}', r"algorithm.gamma must be .*\(0, 1\), got 1.0"),
-        ('ppo {"replicas": 3}', "algorithm.n_envs must be a multiple of 3 replicas, got 128"),
+        ('dqn {"gamma": 1.0}', r"algorithm.gamma must be .*1.0"),
+        ('ppo {"replicas": 3}', "algorithm.n_envs must be .*128"),
         ('recurrent-ppo {"policy": "road"}', "algorithm.policy must be mlp, got 'road'"),
-        ('plackett-luce {"swaps": {"step": 0}}', "algorithm.swaps.step must be .*> 0, got 0"),
         (
             'plackett-luce {"swaps": {"rounds": 0}, "regression": {"rounds": 0}}',
-            "algorithm.swaps.rounds must be .*, got 0",
+            "algorithm.swaps.rounds must be .*0",
         ),
     ],
 )
@@ -86,92 +85,36 @@ def env(**keywords):
     return (f"{SHORT} {json.dumps({'horizon': 80, **keywords})}",)
 
 
+FEW = make_algorithm(swaps={"seconds": 24, "rounds": 1})
+SECURE = env(privacy={"noise": "secure"})
+SUMS = f"{SumRelease.__module__}:SumRelease"
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"seed": -1}, r"seed must be an integer in 0\.\.999, got -1"),
-        ({"traffic_seeds": (0, 2000)}, r"train_seeds must be traffic seeds in 0\.\.999, got 2000"),
-        ({"validation_seeds": (0,)}, r"validation_seeds must be .* 1000\.\.1999, got 0"),
-        ({"envs": ()}, r"env must be one or more environments, got \(\)"),
-        ({"envs": env(action="mask")}, "env: action is chosen by the training"),
-        ({"envs": env(records="mine")}, "env: records is chosen by the training"),
+        ({"seed": -1}, r"seed must be .*0\.\.999, got -1"),
+        ({"algorithm": "ppo", "steps": None}, r"minutes and steps must be .*\[None, None\]"),
+        ({"algorithm": "ppo", "minutes": 1.0}, "minutes and steps must be"),
+        ({"steps": 3}, "steps must be left out"),
+        ({"algorithm": "dqn", "initial": "short-highway"}, "initial .*'short-highway'"),
+        ({"envs": env(action="mask")}, "env: action is chosen"),
+        ({"envs": env(records="mine")}, "env: records is chosen"),
         ({"envs": (f"{SHORT} 3",)}, "env must be an id and a JSON object, got"),
         ({"envs": env(estimatr="ukf")}, "estimatr is unknown"),
-        ({"envs": env(horizon=60)}, "horizon or the road's duration must be above the 60 s"),
+        ({"envs": env(horizon=60)}, "horizon .* above the 60 s"),
+        ({"envs": env(horizon=61), "algorithm": FEW}, "horizon must be 62 s .* got 61"),
+        ({"envs": env(bandwidth=6)}, "bandwidth must be below 6 .* got 6"),
         ({"envs": (ENV, *env(privacy="paced"))}, "env: .*paced.*: .* the same channels"),
-        (
-            {"envs": (ENV, OTHER), "algorithm": make_algorithm("ppo"), "steps": 9},
-            "env must be one environment for ppo, got .*PrivateHighway",
-        ),
-        (
-            {"envs": (ENV,), "algorithm": make_algorithm("dqn"), "steps": 9},
-            "algorithm must be one of ppo, .*, plackett-luce where bandwidth is 2 .*, got dqn",
-        ),
-        (
-            {"algorithm": make_algorithm("ppo"), "envs": env(**PAIRS), "steps": 9},
-            'algorithm must be one of ppo {"policy": "mlp"}, maskable-ppo, .*, got ppo',
-        ),
-        (
-            {
-                "algorithm": make_algorithm("ppo"),
-                "envs": env(privacy={"noise": "secure"}),
-                "steps": 9,
-            },
-            "algorithm.replicas must be 1 where privacy.noise is 'secure', .*, got 2",
-        ),
-        (
-            {"envs": env(privacy=f"{SumRelease.__module__}:SumRelease")},
-            "privacy.preset must be one whose noise can be set where .*, got '.*SumRelease'",
-        ),
-        ({"envs": env(bandwidth=6)}, "bandwidth must be below 6 where .*, got 6"),
-        (
-            {
-                "envs": env(horizon=61),
-                "algorithm": make_algorithm(swaps={"seconds": 24, "rounds": 1}),
-            },
-            "horizon must be 62 s or more where .*, got 61",
-        ),
+        ({"envs": (ENV, OTHER), "algorithm": "ppo"}, "env must be one .*PrivateHighway"),
+        ({"envs": env(**PAIRS), "algorithm": "ppo"}, "algorithm must be one of .*, got ppo"),
+        ({"envs": SECURE, "algorithm": "ppo"}, "algorithm.replicas must be 1 .* got 2"),
+        ({"envs": env(privacy=SUMS)}, "privacy.preset must be .*SumRelease"),
     ],
 )
 def test_plans_that_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         make_plan(**changes).check()
-
-
-@pytest.mark.parametrize(
-    ("name", "changes", "message"),
-    [
-        (
-            "ppo",
-            {"steps": None},
-            r"minutes and steps must be one of .* got \[None, None\]",
-        ),
-        (
-            "ppo",
-            {"minutes": 1.0, "steps": 9},
-            "minutes and steps must be one of the two for ppo",
-        ),
-        (
-            "ppo",
-            {"minutes": 0.0, "steps": None},
-            "minutes must be a finite number > 0 or None",
-        ),
-        ("ppo", {"steps": 0}, "steps must be an integer >= 1 or None, got 0"),
-        (
-            "plackett-luce",
-            {"steps": 3},
-            "steps must be left out for .*, which trains in rounds",
-        ),
-        (
-            "dqn",
-            {"initial": "short-highway"},
-            "initial must be left out .*, got 'short-highway'",
-        ),
-    ],
-)
-def test_lengths_and_beginnings_that_are_refused(name, changes, message):
-    with pytest.raises(ValueError, match=message):
-        make_plan(name, **changes)
 
 
 def test_longer_roads_get_fewer_episodes():

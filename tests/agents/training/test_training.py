@@ -1,10 +1,7 @@
 """Trainings in their folders: killed and gone on with, validated, refused, several at once."""
 
 import json
-import multiprocessing
 import shutil
-import signal
-import sys
 from itertools import count
 from pathlib import Path
 
@@ -24,7 +21,7 @@ from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
 from agents.training import training
 from agents.training.plan import make_policies
-from agents.training.run import BEST, CURVE, POLICY, RULES, RULES_FILE, Run
+from agents.training.run import BEST, CURVE, POLICY, RULES, RULES_FILE, Run, least
 from agents.training.run_files import CHECKPOINT, PROGRESS, read_checkpoint, read_progress
 from agents.training.settings import ALGORITHMS, parse_algorithm
 from agents.training.training import train, train_all
@@ -40,7 +37,6 @@ from tests.agents.training.plans import (
     WIDE,
     StopError,
     ended_at,
-    kill,
     make_algorithm,
     make_plan,
     stop,
@@ -75,32 +71,7 @@ def assert_alike(folder, other):
     assert curves[0] == curves[1]
 
 
-def killed(folder, update, **changes):
-    """Train in a child that is killed as the row of an update comes."""
-    with ended_at(update, kill):
-        train(make_plan(**changes), folder)
-
-
 # --- going on -------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal for a process")
-@pytest.mark.parametrize(("update", "more"), [(0, ()), (1, ()), (2, ()), (2, (WIDE,))])
-def test_a_training_that_is_killed_goes_on_to_the_same_bits(update, more, whole, tmp_path):
-    changes = {"envs": (ENV, *more)} if more else {}
-    child = multiprocessing.get_context("spawn").Process(
-        target=killed, args=(tmp_path / "killed", update), kwargs=changes
-    )
-    child.start()
-    child.join(300)
-    assert child.exitcode == -signal.SIGKILL
-    kept = read_checkpoint(tmp_path / "killed") if update else None
-    # What was done before the round in which it died is not done again.
-    assert update == 0 or [row["update"] for row in kept["rows"]] == list(range(update))
-    torch.manual_seed(99)
-    train(make_plan(**changes), tmp_path / "killed")
-    assert_alike(tmp_path / "killed", whole(**changes)[0])
 
 
 @pytest.mark.slow
@@ -242,6 +213,11 @@ def test_the_best_policy_is_the_best_in_validation(name, whole):
     assert training["traffic seeds"] == "0..2"
 
 
+def test_a_policy_has_the_error_of_the_better_way_to_act():
+    assert least({"validation": 0.2, "validation_drawn": 0.1}) == 0.1
+    assert least({"validation": 0.1, "validation_drawn": 0.2}) == 0.1
+
+
 def test_rules_are_played_once_on_the_same_traffic(whole, monkeypatch, tmp_path):
     folder = shutil.copytree(whole()[0], tmp_path / "run")
     kept = json.loads((folder / RULES_FILE).read_text())
@@ -316,20 +292,18 @@ def test_several_environments_teach_one_network(whole):
     ("changes", "message"),
     [
         ({"seed": 2}, "seed is 1 there and 2 now"),
-        ({"envs": (ENV.replace("80", "81"),)}, r"envs is \[.*80.*\] there and \[.*81.*\] now"),
-        ({"traffic_seeds": (0, 1)}, r"traffic_seeds is \[0, 1, 2\] there and \[0, 1\] now"),
+        ({"envs": (ENV.replace("80", "81"),)}, r"envs is .*80.* there and .*81.* now"),
         ({"algorithm": make_algorithm(width=9)}, r"algorithm\.width is 8 there and 9 now"),
-        (
-            {"algorithm": make_algorithm("ppo"), "steps": STEPS},
-            "algorithm.name is 'plackett-luce' there and 'ppo' now",
-        ),
+        ({"algorithm": "ppo"}, "algorithm.name is 'plackett-luce' there and 'ppo' now"),
     ],
 )
-def test_the_folder_of_another_plan_is_refused(changes, message, whole):
+def test_the_folder_of_another_plan_is_refused(changes, message, whole, tmp_path):
     folder = whole()[0]
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    plans = {tmp_path / "first": make_plan(), folder: make_plan(**changes)}
     with pytest.raises(ValueError, match=message):
-        train(make_plan(**changes), folder)
+        train_all(plans, this_process)
+    assert not (tmp_path / "first").exists()
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
@@ -368,13 +342,6 @@ def test_trainings_at_once_come_out_as_alone(whole, tmp_path):
     assert not any(torch.equal(first[key], second[key]) for key in first)
 
 
-def test_a_folder_of_another_plan_is_refused_before_anything_runs(whole, tmp_path):
-    plans = {tmp_path / "9": make_plan(), whole()[0]: make_plan(seed=9)}
-    with pytest.raises(ValueError, match="seed is 1 there and 9 now"):
-        train_all(plans, this_process)
-    assert not (tmp_path / "9").exists()
-
-
 def apart(work, tasks):
     """Train on the disk of another machine."""
     yield 0, None
@@ -388,22 +355,17 @@ def test_rules_are_played_once_for_each_environment(tmp_path, monkeypatch):
     played = []
     monkeypatch.setattr(training, "keep_rules", keep)
     plans = [make_plan(), make_plan(envs=(ONE,)), make_plan(seed=2)]
-    with pytest.raises(ExecutorError):
+    with pytest.raises(ExecutorError, match="--output that all nodes have"):
         train_all({tmp_path / str(k): plan for k, plan in enumerate(plans)}, apart)
     errors = [json.loads((tmp_path / str(k) / RULES_FILE).read_text())["static"] for k in range(3)]
     assert (errors, played) == ([1.0, 2.0, 1.0], [plans[0].envs, (ONE,)])
-
-
-def test_a_folder_that_workers_do_not_share_is_an_error(tmp_path):
-    with pytest.raises(ExecutorError, match="choose an --output that all nodes have"):
-        train_all({tmp_path / "0": make_plan()}, apart)
 
 
 # --- non-interference; see `tests.test_non_interference` ------------------------------------------
 
 
 @pytest.fixture(
-    scope="module", params=fast_and_slow(ALGORITHMS, ["ppo", "plackett-luce", "recurrent-ppo"])
+    scope="module", params=fast_and_slow(ALGORITHMS, ["plackett-luce", "recurrent-ppo"])
 )
 def private(request, tmp_path_factory):
     """A policy of every algorithm, trained a little with the truth at hand."""
@@ -440,16 +402,3 @@ def test_traffic_does_not_show_through_a_trained_policy(private, deterministic):
         return policy.predict(observation, state, np.array([state is None]), deterministic)
 
     assert not unlike(env, Acting(act))
-
-
-@pytest.mark.parametrize("action", ["slots", "sequential"])
-def test_a_policy_that_sees_the_truth_would_show(action):
-    env = blind(make_private(action=action))
-    process, interface = env.unwrapped.process, env.unwrapped.interface
-
-    def crowded(observation, state):
-        density = process.truth(np.array([0]))[:, :15, 0]
-        wanted = density.argsort(axis=1).argsort(axis=1) >= 15 - interface.queries.bandwidth
-        return interface.actions.encode(wanted, process.pending.picked)[0], None
-
-    assert unlike(env, Acting(crowded))
