@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.audit.planner import KINDS, Planner, plan_contributions, public_plan
+from agents.audit.planner import Planner, plan_contributions, public_plan
 from agents.audit.worlds import Trajectory, Worlds
 from dptse_env.parts import privacy_report
 from dptse_env.release import Paced
@@ -86,10 +86,12 @@ def test_the_worst_case_is_the_whole_of_mu(setting, record):
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "open_loop"])
-@pytest.mark.parametrize("privacy", [{"clip": 25.0}, {"clip": 51.0}, {"unit": "event"}])
+@pytest.mark.parametrize(
+    "privacy", [{"clip": 25.0}, {"clip": 51.0}, {"unit": "event"}, {"adjacency": "add_remove"}]
+)
 def test_the_worst_case_is_nearly_the_whole_of_mu(estimator, privacy, record):
     setting = paced(estimator, **privacy)
-    assert 0.96 < reached(setting, Planner(setting).choose(record, "worst-case")) <= 1.0
+    assert 0.94 < reached(setting, Planner(setting).choose(record, "worst-case")) <= 1.0
 
 
 def opposite(setting, record):
@@ -126,35 +128,11 @@ def test_a_fault_that_two_vehicles_on_one_segment_show_is_found(record):
     assert reached(mutant, Planner(mutant).choose(record, "worst-case")) > 1.05
 
 
-def test_a_lone_vehicle_is_the_worst_case_of_add_remove(record):
-    setting = paced(adjacency="add_remove")
-    worlds = Planner(setting).choose(record, "worst-case")
-    assert [len(path.step) for path in worlds.pair] == [HORIZON, 0]
-    assert 0.94 < reached(setting, worlds) <= 1.0
-
-
-PACED = [
-    {},
-    {"adjacency": "add_remove"},
-    {"adjacency": "add_remove", "ratio": 20.0},
-    {"unit": "event"},
-    {"unit": "event", "adjacency": "add_remove"},
-    {"boundary_inputs": "private"},
-    {"clip": 5.0, "ratio": 0.1},
-    {"epsilon": 0.1},
-]
-FEW = [
+TARGETS = [
     ("deleted", config(cap=2)),
     ("replaced", config(boundary_inputs="private")),
     ("worst-case", paced("random_walk", adjacency="add_remove", ratio=20.0)),
     ("deleted", paced("random_walk", unit="event")),
-]
-ALL = [
-    (kind, setting)
-    for kind in KINDS
-    for setting in (*(paced("random_walk", **each) for each in PACED), *CAPPED, *MORE_CAPPED)
-    if setting.privacy.adjacency == "replace" or kind != "replaced"
-    if (kind, setting) not in FEW
 ]
 
 
@@ -169,7 +147,7 @@ def test_options_of_several_segments_reach_mu_and_no_more(spans, record):
         assert least < reached(setting, worlds, plan) <= 1.0 + 1e-9
 
 
-@pytest.mark.parametrize(("kind", "setting"), fast_and_slow([*FEW, *ALL], FEW))
+@pytest.mark.parametrize(("kind", "setting"), TARGETS)
 def test_no_target_exceeds_mu(kind, setting, record):
     worlds = Planner(setting).choose(record, kind)
     for plan in (None, public_plan(setting, "round-robin")):
@@ -179,7 +157,7 @@ def test_no_target_exceeds_mu(kind, setting, record):
         assert len({int(step) for path in worlds.pair for step in path.step}) == 1
 
 
-@pytest.mark.parametrize("setting", [config(preset="corrected"), config(cap=2), paced(horizon=10)])
+@pytest.mark.parametrize("setting", [config(cap=2), paced(horizon=10)])
 def test_the_vehicle_that_is_deleted_tells_most(setting, record):
     chosen = reached(setting, Planner(setting).choose(record, "deleted"))
     everyone = []
@@ -193,23 +171,10 @@ def test_the_vehicle_that_is_deleted_tells_most(setting, record):
 
 
 def test_a_replaced_vehicle_tells_more_than_a_deleted_one(record):
-    for setting in (config(preset="corrected"), config()):
-        planner = Planner(setting)
-        kinds = ("replaced", "deleted")
-        replaced, deleted = (reached(setting, planner.choose(record, kind)) for kind in kinds)
-        assert replaced > 1.2 * deleted
-
-
-@pytest.mark.parametrize(
-    ("setting", "kind"),
-    [
-        (config(adjacency="add_remove"), "replaced"),
-        (config(), "nobody"),
-    ],
-)
-def test_targets_that_do_not_fit_are_named(setting, kind, record):
-    with pytest.raises(ValueError, match=rf"target must be one of \[.*\].* got '{kind}'"):
-        Planner(setting).choose(record, kind)
+    setting = config()
+    kinds = "replaced", "deleted"
+    replaced, deleted = (reached(setting, Planner(setting).choose(record, kind)) for kind in kinds)
+    assert replaced > 1.2 * deleted
 
 
 @pytest.mark.parametrize(("kind", "need"), [("deleted", 1), ("replaced", 2)])
