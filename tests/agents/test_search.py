@@ -7,7 +7,7 @@ import gymnasium as gym
 import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 
-from agents.executors import make_executor, this_process
+from agents.executors import this_process
 from agents.play import Cell
 from agents.search.space import (
     DEMAND_START,
@@ -174,14 +174,6 @@ def test_a_search_that_was_interrupted_comes_out_as_one_that_was_not(
     assert finished(study) == finished(whole)[:20]
     n_trials = len(study.get_trials())
     assert len(run(tmp_path, 20).get_trials()) == n_trials
-
-
-@pytest.mark.slow
-def test_several_workers_share_a_journal(tmp_path):
-    study = run(tmp_path, 30, executor=make_executor("local", 2))
-    assert n_finished(study) == len(study.get_trials()) == 30
-    assert len({tuple(t.params.values()) for t in study.get_trials()}) == 30
-    assert set(chosen(study)) == {"defaults", "present", "tuned"}
 
 
 def test_a_score_that_is_not_finite_is_never_the_best(tmp_path):
