@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -6,10 +5,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from agents.executors import this_process
 from agents.studies import estimators as study
-from agents.studies.estimators import STUDY, sensed
-from agents.study import Place, read_rows, run
+from agents.studies.estimators import sensed
+from agents.study import read_rows
 from dptse_env.privacy import mu_of
 
 RECORDED = Path(__file__).parents[3] / "results" / "estimators"
@@ -63,20 +61,6 @@ def test_sensors_alone_have_the_budget_that_they_are_said_to_have():
     queries = sensed("paced", "ekf", sensors=study.QUERIES)
     assert mu_by_group(queries) == {"queries": pytest.approx(whole)}
     assert study.alone("printed", "ekf") == study.alone("printed", "ekf", study.PART)
-
-
-@pytest.mark.slow
-def test_it_plays_and_reports(tmp_path):
-    found = (study.world_cell("ShortHighway-v0", name) for name in study.MOVED[:2])
-    cells = [replace(each, keywords={**each.keywords, "horizon": 90}, seeds=None) for each in found]
-    small = replace(STUDY, cells=tuple(cells), seeds=(2000, 2001))
-    run(small, Place(tmp_path, this_process))
-    rows = read_rows("estimators", tmp_path)
-    assert len(rows) == 4
-    error = -1000.0 * rows.filter(estimator="ekf")["reward"].mean()
-    assert f"| ShortHighway-v0 | none | {error:.1f} [" in (tmp_path / "tables.md").read_text(
-        "utf-8"
-    )
 
 
 def test_loops_stand_beside_queries_and_alone():

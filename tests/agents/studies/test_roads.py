@@ -7,7 +7,6 @@ from agents.environments import make_config, quietly
 from agents.filters.highways import KINDS
 from agents.filters.plan import FilterPlan
 from agents.filters.scenarios import ScenarioRanges
-from agents.filters.sections import SLOW
 from agents.studies import roads
 from agents.studies.roads import drawn, on_road, recorded
 from agents.study import read_rows
@@ -15,7 +14,6 @@ from agents.tables import pick
 from dptse_env.estimators import recurrent
 from dptse_env.importers.folder import ROAD
 from dptse_env.traffic import CORRIDORS, write_corridor
-from dptse_env.traffic.imported import load_record
 
 RECORDED = Path(__file__).parents[3] / "results" / "roads"
 WEIGHTS = Path(recurrent.__file__).parent / "weights"
@@ -107,25 +105,6 @@ def test_the_summary_is_the_mean_over_own_roads_that_were_played(rows):
     said = roads.summary(some, "")
     assert f"`paced`: {gain:.1f} % below" in said
     assert "over 1 own roads" in said
-
-
-def queue_of(road, record):
-    """Return where a section has a queue; None where that is not clear."""
-    lengths, limits = road.road.lengths, road.road.limits
-    slow = (record.traffic(lengths, limits)[..., 1] < SLOW * limits).mean(axis=0)
-    mainline, (start, end) = slow[: road.geometry.n_mainline], slow[road.geometry.n_segments :][:2]
-    if min(mainline[-1], end) > 0.15:
-        return "queue through the end"
-    if mainline.max() > 0.15 and end < 0.02:
-        return "queue inside"
-    return "no queue" if max(*mainline, start, end) < 0.02 else None
-
-
-@pytest.mark.slow
-def test_sections_are_as_they_are_called():
-    for queue, numbers in recorded.QUEUES.items():
-        road = CORRIDORS.find(f"agents.studies.roads.recorded:section_{numbers[1]}")()
-        assert queue_of(road, load_record(road, numbers[1])) == queue
 
 
 def test_a_section_is_made_once_in_one_piece(tmp_path, monkeypatch):
