@@ -14,7 +14,7 @@ from dptse_env.process import QueryProcess
 from dptse_env.release import Group
 from dptse_env.release.noise import BLOCK
 from dptse_env.traffic import Penetration
-from tests.helpers import SumRelease, lock_step, pairwise
+from tests.helpers import SumRelease, lock_step
 from tests.release.worlds import LENGTH, ONE
 
 SHARE = 0.3
@@ -171,21 +171,6 @@ def test_what_is_spent_grows_to_mu_by_the_largest_charges_of_both_groups(preset)
 # --- the process -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("preset", "errors"),
-    pairwise(PRESETS, [{}, {"dropout": 0.3, "absolute": 0.5}], n=4, rest=False),
-)
-def test_a_fork_gives_the_bits_of_its_origin_and_leaves_it_alone(preset, errors):
-    process = begun(preset, sensor_settings=errors)
-    play(process, 5)
-    fork = process.fork()
-    ahead, again = ([measured.values for *_, measured in play(each, 5)] for each in (fork, process))
-    np.testing.assert_array_equal(ahead, again)
-    np.testing.assert_array_equal(fork.estimate.density, process.estimate.density)
-    assert fork.release.task is process.release.task
-    assert fork.release.traffic is process.traffic
-
-
 def test_given_noise_reaches_both_groups():
     process = begun()
     process.release.give_noise(np.zeros((1, process.release.task.n_channels, 2)))
@@ -273,9 +258,3 @@ def test_errors_are_as_large_as_the_deviation_of_the_measurement_says(preset):
 def test_bad_sensors_are_refused_by_path(keywords, message):
     with pytest.raises(ValueError, match=message):
         resolve("short-plain", keywords)
-
-
-def test_sensors_without_errors_are_exact():
-    assert SensorSettings().are_exact
-    assert SensorSettings(budget_share=0.5).are_exact
-    assert not SensorSettings(factor=1.1).are_exact
