@@ -1,7 +1,5 @@
 """Consequences of the equations: exact solutions, balances, bounds, and the limits of each face."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,7 +12,6 @@ from .oracle import (
     HIGHWAY,
     NO_RELAXATION,
     PUBLISHED,
-    STRAIGHT,
     W99,
     Oracle,
     random_inputs,
@@ -23,9 +20,6 @@ from .oracle import (
 
 seeds = st.integers(0, 2**32 - 1)
 both_sets = pytest.mark.parametrize("parameters", [PUBLISHED, W99], ids=lambda p: p.name)
-PLAIN = Stretch(n_mainline=4)
-MERGE = Stretch(n_mainline=4, on_ramps=(2,), ramp_lanes=3)
-DIVERGE = Stretch(n_mainline=4, off_ramps=(2,), exit_shares=(0.1,))
 
 
 def drawn(model, seed, n=4):
@@ -33,30 +27,7 @@ def drawn(model, seed, n=4):
     return random_states(model, n, rng), random_inputs(model, n, rng)
 
 
-def uniform(model, density, w):
-    """State and inputs of a straight road in one condition everywhere."""
-    rho, jam = np.full((1, model.n_segments), density), model.jam_density[0]
-    demand = Oracle(STRAIGHT, model.parameters).demand(np.array(density), w, jam)
-    states = model.states(rho, w - model.pressure(rho))
-    return states, np.array([[float(demand), w, density]])
-
-
 # Exact solutions ----------------------------------------------------------------------------------
-
-
-@both_sets
-@pytest.mark.parametrize(("filling", "w_share"), [(0.2, 0.9), (0.2, 1.1), (0.05, 0.5), (0.9, 1.0)])
-def test_a_uniform_road_relaxes_by_the_closed_form(parameters, filling, w_share):
-    """To an equilibrium, where it stays."""
-    model = ARZModel(STRAIGHT.road, parameters)
-    v_f, density = parameters.free_flow_speed, filling * parameters.jam_density
-    w_0 = max(w_share * v_f, float(model.pressure(density)[0]))
-    states, _ = uniform(model, density, w_0)
-    for k in range(50):
-        w = v_f + (w_0 - v_f) * (1.0 - 1.0 / parameters.relaxation_time) ** k
-        expected, inputs = uniform(model, density, w)
-        np.testing.assert_allclose(states, expected, rtol=1e-10)
-        states = model.step(states, inputs)
 
 
 V_F, JAM, GAMMA = PUBLISHED.free_flow_speed, PUBLISHED.jam_density, PUBLISHED.gamma
@@ -175,18 +146,3 @@ def test_an_empty_road_stays_empty_and_finite():
     np.testing.assert_array_equal(model.step(states, inputs), states)
     assert np.all(np.isfinite(model.jacobian(states, inputs)))
     np.testing.assert_array_equal(model.speed(states), PUBLISHED.free_flow_speed)
-
-
-@given(seed=seeds)
-def test_a_merge_with_an_empty_ramp_and_a_diverge_that_nobody_takes_are_plain_faces(seed):
-    merge, plain = ARZModel(MERGE.road, PUBLISHED), ARZModel(PLAIN.road, PUBLISHED)
-    states, inputs = drawn(merge, seed)
-    states[:, 8:], inputs[:, 3] = 0.0, 0.0
-    straight, merged = plain.step(states[:, :8], inputs[:, :3]), merge.step(states, inputs)
-    np.testing.assert_allclose(merged[:, :8], straight, rtol=1e-12, atol=1e-9)
-    np.testing.assert_array_equal(merged[:, 8:], 0.0)
-    states[:, 8:] = 30.0, 30.0 * 102.0  # a ramp that takes in something, however little
-    for share, atol in ((0.0, 1e-7), (1e-12, 1e-4)):
-        diverge = ARZModel(replace(DIVERGE, exit_shares=(share,)).road, PUBLISHED)
-        through = diverge.step(states, inputs[:, [0, 1, 2, 3]])
-        np.testing.assert_allclose(through[:, :8], straight, rtol=1e-9, atol=atol)

@@ -28,15 +28,6 @@ def test_golden_values_of_the_paper_highway():
     assert sensitivity.assumptions == (("n_sensors", 8), ("average_dwell_steps", 8.0))
 
 
-@given(st.integers(1, 40), st.floats(1.0, 60.0), st.floats(0.05, 1.0))
-def test_the_paper_s_bound_is_a_count_of_what_one_vehicle_changes(n_sensors, dwell, length):
-    """Twice per sensor (once in either record) for the dwell, 1 / length each time."""
-    changed = {"n_sensors": n_sensors, "average_dwell": dwell, "segment_length": length}
-    density, _ = paper_sensitivity(**{**PAPER, **changed}).releases
-    squares = sum(2.0 * dwell * (1.0 / length) ** 2 for _ in range(n_sensors))
-    assert density.bound == pytest.approx(math.sqrt(squares), rel=1e-12)
-
-
 # --- bounded contributions -------------------------------------------------------------------
 
 

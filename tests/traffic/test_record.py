@@ -4,8 +4,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dptse_env.traffic import SHORT_HIGHWAY, InvalidRecordError, Record, average_dwell
 from dptse_env.utils.files import read_tensors
@@ -49,28 +47,6 @@ def test_counts_and_speed_sums_by_hand():
     for array in (*record.arrays.values(), record.counts, record.offsets, Record(**FIELD).field):
         assert not array.flags.writeable
     assert (record.n_vehicles, record.has_vehicles) == (5, True)
-
-
-def once_a_step():
-    entry = st.tuples(st.integers(0, 5), st.integers(0, 9), st.integers(0, 3))
-    return st.lists(entry, max_size=40, unique_by=lambda one: one[:2])
-
-
-@given(once_a_step())
-def test_offsets_and_grids_agree_with_a_loop(entries):
-    entries.sort()
-    step, vehicle, segment = zip(*entries, strict=True) if entries else ((), (), ())
-    speed = np.linspace(0, 100, len(entries))
-    record = Record(
-        step=step, vehicle=vehicle, segment=segment, speed=speed, n_steps=6, n_columns=4
-    )
-    for k in range(6):
-        rows = slice(*record.offsets[k : k + 2])
-        assert list(record.step[rows]) == [k] * sum(s == k for s in step)
-        for j in range(4):
-            here = (record.step == k) & (record.segment == j)
-            assert record.counts[k, j] == here.sum()
-            assert record.speed_sums[k, j] == pytest.approx(record.speed[here].sum(), rel=1e-6)
 
 
 IMPOSSIBLE = [

@@ -131,11 +131,8 @@ def test_a_file_imports_no_code(road, keyword, value, path, monkeypatch):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("bandwidth = 0", r"environment\.bandwidth must be an integer in 1"),
-        (
-            'estimator = "best"',
-            r"environment\.estimator must be one of .*, asm, or, .*, got 'best'",
-        ),
+        ("bandwidth = 0", r"environment\.bandwidth must be"),
+        ('estimator = "best"', r"environment\.estimator must be .*, got 'best'"),
         ("epsilon = 0", r"environment\.privacy\.epsilon must be"),
         ('incident = "some"', r"environment\.corridor\.incident must be one of"),
         ('"a\\nb" = 0', r"environment\.a\\nb is unknown"),
