@@ -248,6 +248,8 @@ def test_a_column_is_that_of_its_own_spelling(tmp_path, expected):
 
 LONG = "x" * 100_000
 DOCUMENT = i24(stream())[0]
+DATES = io.BytesIO()
+pl.DataFrame({"t": [0], "id": 1, "s": 2, "v": 3}).cast({"t": pl.Date}).write_parquet(DATES)
 BAD = {
     "a.csv": [
         ("", "the file is empty"),
@@ -268,7 +270,10 @@ BAD = {
         ("not compressed", r"source\.columns\.time must be a column of the file, got 't'"),
         (gzip.compress(b"t,id,s,v" * 99)[:-9], "the file cannot be read: Compressed file ended"),
     ],
-    "a.parquet": [("PAR1 and no more", "it is no complete Parquet file")],
+    "a.parquet": [
+        ("PAR1 and no more", "it is no complete Parquet file"),
+        (DATES.getvalue(), "got Date"),
+    ],
     "a.json": [
         (json.dumps(i24(stream()))[:-2000], "JSON must be a complete array of documents, .*Syntax"),
         ("[" * 100_000, "JSON must be a complete array of documents"),
@@ -301,13 +306,6 @@ def test_bad_files_are_named_by_row_and_field_in_few_words(name, tmp_path):
             run(path, source)
         assert str(refused.value).startswith(str(path))
         assert len(str(refused.value)) < 500 + len(str(path))
-
-
-def test_times_that_are_no_numbers_are_refused(tmp_path):
-    dates = pl.DataFrame({"t": [0], "id": 1, "s": 2, "v": 3}).cast({"t": pl.Date})
-    dates.write_parquet(tmp_path / "a.parquet")
-    with pytest.raises(TrajectoryError, match="t must be numbers, got Date"):
-        run(tmp_path / "a.parquet")
 
 
 @pytest.mark.parametrize(

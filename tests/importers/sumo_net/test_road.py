@@ -92,26 +92,6 @@ def test_every_vehicle_on_the_path_and_its_ramps_is_counted_once(road):
     assert max(counts) > 30
 
 
-def test_vehicles_pass_from_segment_to_segment_without_gaps(road):
-    record, corridor = road.record, road.corridor
-    N, S = corridor.geometry.n_mainline, corridor.geometry.n_segments
-    order = np.lexsort((record.step, record.vehicle))
-    vehicle, step, column = (
-        each[order].astype(int) for each in (record.vehicle, record.step, record.segment)
-    )
-    same = vehicle[1:] == vehicle[:-1]
-    assert set(np.diff(step)[same]) == {1}
-    passages = set(zip(column[:-1][same], column[1:][same], strict=True))
-    passages = {(here, there) for here, there in passages if here != there}
-    (on,), (off,) = corridor.geometry.on_ramps, corridor.geometry.off_ramps
-    assert passages == {
-        *((i, i + 1) for i in range(N - 1)),
-        *((S, 0), (N - 1, S + 1)),
-        *((S + 2, N), (N, on)),
-        *((off - 1, N + 1), (N + 1, S + 3)),
-    }
-
-
 def test_the_record_is_that_of_the_generated_net_if_the_files_are_the_same(tmp_path):
     calm = SHORT_HIGHWAY.replaced(incident=None)
     scenario = draw_scenario(calm, 3)
