@@ -6,7 +6,6 @@ import math
 from fractions import Fraction
 from functools import cache
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -96,17 +95,6 @@ def test_no_vehicle_has_spent_more_than_info_says(privacy, what, most):
     again = process.release.private(ONE, process.traffic_index)
     assert not any(again[what][0])
     assert not any(again["individual_epsilon"][0])
-
-
-def test_a_spec_with_every_keyword_of_paced_ledgers_survives_json():
-    privacy = {
-        "epsilon": 2.0, "delta": 0.01, "unit": "event", "adjacency": "add_remove",
-        "clip": 25.0, "ratio": 3.0, "boundary_inputs": "private",
-    }  # fmt: skip
-    given = {"privacy": privacy, "traffic_seeds": "0:2", "horizon": 20}
-    env = gym.make("dptse_env:dptse/PrivateHighway-v1", **given)
-    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.config == env.unwrapped.config
 
 
 # --- no two worlds are further apart than mu ------------------------------------------------------

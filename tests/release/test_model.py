@@ -1,24 +1,38 @@
 """Settings of release models, and what is asked of a model of another package."""
 
 import dataclasses
-import json
+import math
+from functools import partial
 
 import numpy as np
 import pytest
 
-from dptse_env.release import PrivacySettings, check_released
+from dptse_env.release import CappedSettings, PacedSettings, PrivacySettings, check_released
 from tests.helpers import PricedRelease
 
 from .worlds import COLUMNS, ONE, Worlds, request, stays
 
+BAD_SETTINGS = [
+    (CappedSettings, {"epsilon": 0.0}, r"epsilon must be .*, got 0\.0$"),
+    (CappedSettings, {"delta": True}, r"delta must be .*, got True$"),
+    (CappedSettings, {"cap": 0}, r"cap must be .*, got 0$"),
+    (CappedSettings, {"share": 0.0}, r"share must be .*, got 0\.0$"),
+    (
+        CappedSettings,
+        {"unit": np.zeros(2)},
+        r"unit must be .*, got \[0\.0, 0\.0\]$",
+    ),
+    (PacedSettings, {"clip": math.inf}, r"clip must be .*, got inf$"),
+    (PacedSettings, {"ratio": 1.0001}, r"ratio must be at most 1 for .*, got 1\.0001$"),
+    (PacedSettings, {"unit": "horizon"}, r"unit must be one of trip, event, got 'horizon'$"),
+]
 
-def test_settings_default_to_the_paper_and_survive_json():
-    settings = PrivacySettings()
-    assert settings == PrivacySettings("printed", 1, 0.05)
-    assert PrivacySettings(**json.loads(json.dumps(dataclasses.asdict(settings)))) == settings
-    assert hash(settings) == hash(PrivacySettings())
-    for two in (2, np.float64(2.0)):
-        assert type(PrivacySettings(epsilon=two).epsilon) is float
+
+@pytest.mark.parametrize(("kind", "fields", "message"), BAD_SETTINGS)
+def test_bad_settings_are_named_with_their_path(kind, fields, message):
+    for make in (kind, partial(dataclasses.replace, kind())):
+        with pytest.raises(ValueError, match=rf"^privacy\.{message}"):
+            make(**fields)
 
 
 def released(**changes):
