@@ -31,11 +31,6 @@ def test_the_checkers_find_nothing(env_id, action):  # a warning is an error, to
     env.close()
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_no_id_has_a_newer_version(env_id):
-    gym.make(env_id)  # Gymnasium's warning would be an error here
-
-
 @pytest.mark.slow
 def test_importing_the_package_and_making_environments_is_light():
     code = """
@@ -156,23 +151,6 @@ def test_a_pickled_environment_goes_on_where_it_was():
         chosen = env.action_space.sample()
         assert_same(env.step(chosen), copy.step(chosen))
     assert_same(env.render(), copy.render())
-
-
-def test_a_spec_survives_json():
-    env = make_env(
-        action="slots",
-        privacy={"preset": "corrected", "epsilon": 5.0},
-        corridor={"demand": {"mainline": [[0.0, 1500.0]], "on_ramps": [200.0]}},
-        incident={"segment": 3, "phases": [[60.0, 120.0, 20.0]]},
-        parameters={
-            "name": "mine", "free_flow_speed": 120.0, "jam_density": 350.0, "gamma": 1.0,
-            "relaxation_time": 40.0,
-        },
-        estimator_settings={"process_noise": [0.01, 0.01]},
-    )  # fmt: skip
-    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.config == env.unwrapped.config
-    assert_same(play(env, 5), play(again, 5))
 
 
 BAD = {

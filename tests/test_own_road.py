@@ -119,18 +119,24 @@ def told_beyond(make):
     return made, [str(w.message) for w in caught if "was trained on" in str(w.message)]
 
 
-@pytest.mark.parametrize("make", [gym.make, partial(gym.make_vec, num_envs=2)])
 @pytest.mark.parametrize(("name", "keywords", "value"), BEYOND)
-def test_what_lies_beyond_the_card_of_weights_is_told_once(make, name, keywords, value, tmp_path):
+def test_what_lies_beyond_the_card_of_weights_is_told_once(name, keywords, value, tmp_path):
+    """By environments, and by a stream, which has no queries."""
     settings = weights_settings(tmp_path, **KNOWN)
     given = {"estimator": "recurrent", "estimator_settings": settings, "traffic_seeds": [0]}
-    env, told = told_beyond(lambda: make(ID, **given, **keywords))
-    (said,) = told
+    env, (said,) = told_beyond(lambda: gym.make(ID, **given, **keywords))
     low, high = KNOWN[name]
     assert f"weights.safetensors was trained on {name} {low:g} to {high:g}, not {value};" in said
     assert "estimator_settings.recurrent.weights" in env.unwrapped.config.inherited
-    env, told = told_beyond(lambda: make(ID, **given, **WITHIN))
+    env, told = told_beyond(lambda: gym.make(ID, **given, **WITHIN))
     assert (env.unwrapped.config.inherited, told) == ((), [])
+    if "corridor" in keywords:
+        road, known = env.unwrapped.config.corridor.replaced(**keywords["corridor"]), {**KNOWN}
+        settings = weights_settings(tmp_path, **{**known, "flows": [0, 1]})
+        make = partial(RoadEstimator, road, "recurrent", estimator_settings=settings)
+        _, (said,) = told_beyond(make)
+        assert f"{name} " in said
+        assert f"not {value};" in said
 
 
 @pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])

@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from dptse_env.config import resolve
 from dptse_env.estimators import ESTIMATORS, REFERENCES
@@ -123,34 +122,6 @@ def test_a_second_is_predicted_then_released_and_then_read():
     assert order == ["predict", "release", "update"] * 3
 
 
-def test_residuals_are_the_noise_that_is_declared():
-    """Released minus true over sigma: unit variance, uncorrelated over time and quantities."""
-    privacy = {"preset": "capped", "boundary_inputs": "private", "share": 0.3}
-    keywords = {"estimator": "random_walk", "horizon": 120, "traffic_seeds": "0:1"}
-    process = make(1, "private-highway", privacy=privacy, **keywords)
-    residuals, added = [], process.release.noise.added
-
-    def spy(episodes, values, sigma, unit):
-        released = added(episodes, values, sigma, unit)
-        residuals.append((released - values / unit[:, None])[0] / process.release.sigma)
-        return released
-
-    process.release.noise.added = spy
-    for seed in range(3):
-        process.reset(ALL[:1], generators([seed]))
-        for action in sampled(process, 120):
-            process.step(ALL[:1], action[:1])
-    r = np.array(residuals)  # seconds, segments, quantities
-    assert r.size > 10_000
-    for part in (r[..., 0], r[..., 1]):
-        low, high = stats.chi2.interval(1 - 1e-4, part.size) / np.array(part.size)
-        assert low < np.mean(part**2) < high
-    bound = 4.0 / np.sqrt(r.size / 2)
-    for left, right in ((r[1:], r[:-1]), (r[120:], r[:-120]), (r[:, 1:], r[:, :-1]),
-                        (r[..., 0], r[..., 1])):  # fmt: skip
-        assert abs(np.mean(left * right)) < bound
-
-
 def test_released_values_are_kept_until_the_next_query():
     process = begun(1)
     first = np.array([[1, 1, 0, 0, 0, 0]], dtype=np.int8)
@@ -185,33 +156,6 @@ def test_a_step_from_t_predicts_with_t_and_measures_at_t_plus_one():
         expected = process.boundary.inputs(ALL[:1], np.array([1]), np.array([t]))
         np.testing.assert_array_equal(seen["inputs"], expected)
         np.testing.assert_allclose(seen["values"][0, :, 0], record.counts[t + 1, :8] / 0.1)
-
-
-def test_a_diverging_filter_is_flagged_and_the_episode_goes_on():
-    process = begun(1)
-    added = process.release.noise.added
-    process.release.noise.added = lambda episodes, values, *noise: np.full_like(values, np.nan)
-    process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
-    assert process.info(0)["diverged"] == 1.0
-    assert np.isfinite(process.estimate.density).all()
-    process.release.noise.added = added
-    outcome = process.step(ALL[:1], np.ones((1, 6), dtype=np.int8))
-    assert process.info(0)["diverged"] == 0.0
-    assert np.isfinite(outcome.reward).all()
-
-
-def test_an_update_that_is_not_solved_is_said_of_its_episode(monkeypatch):
-    process, nobody = begun(2, estimator="mhe"), np.zeros((2, 6), dtype=np.int8)
-    for _ in range(12):
-        process.step(ALL[:2], nobody)
-    make_unsolvable(process.estimator, monkeypatch)
-    outcome = process.step(ALL[:1], nobody[:1])
-    assert [process.info(e)["fallback"] for e in range(2)] == [1.0, 0.0]
-    assert process.info(0)["diverged"] == 0.0
-    assert np.isfinite(outcome.reward).all()
-    monkeypatch.undo()
-    process.step(ALL[:1], nobody[:1])
-    assert process.info(0)["fallback"] == 0.0
 
 
 # --- steps of several seconds ---------------------------------------------------------------------

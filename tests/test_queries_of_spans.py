@@ -107,28 +107,6 @@ def test_a_sensor_without_an_option_has_a_row_of_its_own():
     assert np.flatnonzero(block(observation, "density_innovation")[0]).tolist() == [0]
 
 
-@pytest.mark.parametrize(
-    ("estimator", "spans"),
-    fast_and_slow(
-        itertools.product(["ekf", "ukf", "enkf", "mhe", "random_walk"], [(2,), (1, 2)]),
-        [("ekf", (1, 2)), ("mhe", (2,)), ("random_walk", (1, 2))],
-    ),
-)
-def test_queries_bring_the_estimate_nearer(estimator, spans):
-    """Averages enter the estimator as what they are: more of them give a smaller error."""
-
-    def error(**keywords):
-        fixed = {"privacy": SumRelease, "horizon": 60, "action": "scores", "estimator": estimator}
-        env = make_batch(8, **fixed, **keywords)
-        env.reset(seed=3)
-        scores = np.linspace([1.0] * 8, 0.0, env.action_space.shape[1], axis=1, dtype=np.float32)
-        rewards = [env.step(scores)[1] for _ in range(59)]
-        return -np.mean(rewards)
-
-    sums = {"query_spans": spans, "bandwidth_unit": "sums"}
-    assert error(bandwidth=5, **sums) < 0.75 * error(bandwidth=1, **sums)
-
-
 def test_blocks_have_the_size_of_queries_and_show_prices_and_the_spent_share():
     process = make_process(query_spans=(2, 3))
     encoding, n_queries = process.interface.observations, 9

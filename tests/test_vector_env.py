@@ -129,13 +129,6 @@ def test_what_is_returned_is_not_touched_later():
     assert_same(seen, kept)
 
 
-def test_a_pickled_environment_goes_on_where_it_was():
-    env = staggered()
-    copy = pickle.loads(pickle.dumps(env))
-    for _ in range(8):
-        assert_same(env.step(ACTIONS), copy.step(ACTIONS))
-
-
 def test_a_void_guarantee_is_warned_of_once_however_environments_are_made():
     void = {"boundary_inputs": "true"}
     with warnings.catch_warnings(record=True) as told:
