@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import combinations, product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -19,7 +19,7 @@ from dptse_env.config import PRESETS, EnvConfig, resolve
 from dptse_env.model import Channels
 from dptse_env.parts import make_interface
 from dptse_env.release import ReleaseModel
-from dptse_env.road import Road, make_road
+from dptse_env.road import make_road
 from dptse_env.traffic import SHORT_HIGHWAY, Conditions, Corridor, Demand, Geometry, Record, Scales
 from dptse_env.utils.kernels import kernel
 
@@ -263,58 +263,26 @@ def record(places: Any, speeds: Any, n_columns: int = SHORT_COLUMNS) -> Record:
     )  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True)
-class Stretch:
-    """The fields of a geometry that a road is made of, within wider limits than a corridor's."""
-
-    n_mainline: int = 15
-    on_ramps: tuple[int, ...] = ()
-    off_ramps: tuple[int, ...] = ()
-    exit_shares: tuple[float, ...] = ()
-    segment_length: float = 0.1
-    speed_limit: float = 102.0
-    lanes: int = 3
-    ramp_lanes: int = 1
-    more_outside: int = 0
-
-    @property
-    def geometry(self) -> Stretch:
-        return self
-
-    @property
-    def road(self) -> Road:
-        road = make_road(self)
-        outside = np.arange(road.lanes.size) >= road.n_segments
-        return road._replace(lanes=road.lanes + self.more_outside * outside)
-
-    @property
-    def n_ramps(self) -> int:
-        return len(self.on_ramps) + len(self.off_ramps)
-
-    @property
-    def n_segments(self) -> int:
-        return self.n_mainline + self.n_ramps
-
-    @property
-    def on_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
-        return tuple((self.n_mainline + i,) for i in range(len(self.on_ramps)))
-
-    @property
-    def off_ramp_segments(self) -> tuple[tuple[int, ...], ...]:
-        first = self.n_mainline + len(self.on_ramps)
-        return tuple((first + o,) for o in range(len(self.off_ramps)))
-
-    @property
-    def segment_lanes(self) -> tuple[int, ...]:
-        return (self.lanes,) * self.n_mainline + (self.ramp_lanes,) * self.n_ramps
-
-    @property
-    def segment_lengths(self) -> tuple[float, ...]:
-        return (self.segment_length,) * self.n_segments
-
-    @property
-    def speed_limits(self) -> tuple[float, ...]:
-        return (self.speed_limit,) * self.n_segments
+def stretch(
+    n_mainline: int = 15, on_ramps: tuple[int, ...] = (), off_ramps: tuple[int, ...] = (),
+    segment_length: float = 0.1, lanes: int = 3, ramp_lanes: int = 1, more_outside: int = 0,
+    **others: Any,
+) -> Any:  # fmt: skip
+    """A road of segments alike, within wider limits than those of a corridor."""
+    n_on, n_ramps = len(on_ramps), len(on_ramps) + len(off_ramps)
+    ramps = tuple((n_mainline + i,) for i in range(n_ramps))
+    n_segments = n_mainline + n_ramps
+    geometry = SimpleNamespace(
+        n_mainline=n_mainline, n_segments=n_segments, on_ramps=on_ramps, off_ramps=off_ramps,
+        on_ramp_segments=ramps[:n_on], off_ramp_segments=ramps[n_on:],
+        segment_lengths=(segment_length,) * n_segments, speed_limits=(102.0,) * n_segments,
+        segment_lanes=(lanes,) * n_mainline + (ramp_lanes,) * n_ramps,
+        **{"exit_shares": (), **others},
+    )  # fmt: skip
+    road = make_road(geometry)
+    outside = np.arange(road.lanes.size) >= road.n_segments
+    road = road._replace(lanes=road.lanes + more_outside * outside)
+    return SimpleNamespace(geometry=geometry, road=road)
 
 
 def make_channels(first: Sequence[int], span: Sequence[int]) -> Channels:

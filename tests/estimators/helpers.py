@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,17 +149,6 @@ def recorded(release: str) -> Episodes:
     truth = model.states(traffic[..., 0], traffic[..., 1])
     each = (array[:, None] for array in (inputs, truth, observed, values))
     return Episodes(model, start, *each, np.broadcast_to(sigma, values[:, None].shape))
-
-
-def with_channels(episodes: Episodes, channels: Channels, places: IntArray) -> Episodes:
-    """The same episodes where more could be measured, what is measured among it at some places."""
-    old = episodes.model
-    model = ARZModel(old.road, old.parameters, centre=old.centre, channels=channels)
-    shape = (*episodes.observed.shape[:2], channels.size)
-    observed, values, sigma = np.zeros(shape, bool), np.zeros((*shape, 2)), np.ones((*shape, 2))
-    observed[..., places], values[..., places, :] = episodes.observed, episodes.values
-    sigma[..., places, :] = episodes.sigma
-    return replace(episodes, model=model, observed=observed, values=values, sigma=sigma)
 
 
 # Running ------------------------------------------------------------------------------------------

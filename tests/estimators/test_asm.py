@@ -17,14 +17,13 @@ from dptse_env.estimators.asm import (
     STALE,
     STALE_VARIANCE,
     TRUSTED,
-    entry_density,
 )
-from dptse_env.model import ARZModel, load_parameters
+from dptse_env.model import ARZModel
 from dptse_env.traffic import PAPER_HIGHWAY
-from tests.helpers import UNEVEN, Stretch, compiled
+from tests.helpers import UNEVEN, stretch
 from tests.model.oracle import PUBLISHED
 
-from .helpers import Episodes, assert_same, run, show, simulate, started, step
+from .helpers import Episodes, run, simulate, started, step
 
 ASM = AdaptiveSmoothingSettings(
     time=6.0, length=0.15, free_wave=90.0, jam_wave=15.0, threshold=55.0, boundary_weight=0.7
@@ -204,7 +203,7 @@ def test_it_is_the_sum_over_all_values_that_its_equations_say(release, road):
 
 def on_a_road(n_steps, observed, values, parameters=PUBLISHED, **fields):
     """An episode of values (T or 1, S, 2) whose inputs say of the ends what is measured first."""
-    model = ARZModel(Stretch(**fields).road, parameters)
+    model = ARZModel(stretch(**fields).road, parameters)
     S = model.n_segments
     density, speed = (np.full((1, model.n_boundaries), values[0, 0, i]) for i in range(2))
     start = model.states(np.full((1, S), values[0, 0, 0]), np.full((1, S), values[0, 0, 1]))
@@ -214,16 +213,6 @@ def on_a_road(n_steps, observed, values, parameters=PUBLISHED, **fields):
         model, start, inputs, np.empty(0), np.broadcast_to(observed, shape),
         np.broadcast_to(values[:, None], (*shape, 2)).copy(), np.full((*shape, 2), 1e-3),
     )  # fmt: skip
-
-
-def test_traffic_that_stays_as_it_is_is_found_from_half_of_its_segments():
-    observed, values = np.arange(15) % 2 == 0, np.tile([45.0, 70.0], (1, 15, 1))
-    episodes = on_a_road(40, observed, values)
-    smoother = started("asm", "compiled", episodes)
-    run(smoother, episodes, range(40))
-    said = smoother.estimate()
-    np.testing.assert_allclose(said.density, 45.0, rtol=1e-9)
-    np.testing.assert_allclose(said.speed, 70.0, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("speed", "wave", "way"), [(15.0, 18.0, -1), (95.0, 120.0, 1)])
@@ -257,50 +246,3 @@ def test_a_mean_stays_when_nothing_follows_for_long():
     after = smoother.estimate()
     np.testing.assert_allclose(after.density, before.density, rtol=1e-9)
     np.testing.assert_allclose(after.speed, before.speed, rtol=1e-9)
-
-
-@pytest.mark.parametrize("parameters", ["published", "w99-3lane"])
-def test_the_density_of_an_entry_is_read_off_the_inputs(parameters):
-    """Up to the critical one: of a congested entry the inputs say no more."""
-    parameters = load_parameters(parameters)
-    model = ARZModel(Stretch(n_mainline=3).road, parameters)
-    v_f, gamma, jam = parameters.free_flow_speed, parameters.gamma, model.arz.jam[3]
-    density = np.linspace(0.0, 0.9 * jam, 60)
-    speed = 0.9 * v_f * np.maximum(1.0 - (density / jam) ** gamma, 0.0)
-    w = speed + v_f * (density / jam) ** gamma
-    inputs = model.boundary_inputs(np.tile(density, (2, 1)).T, np.tile(speed, (2, 1)).T)
-    critical = jam * (w / v_f / (1.0 + gamma)) ** (1.0 / gamma)
-    read = compiled(entry_density)
-    found = [read(demand, each, v_f, gamma, jam) for demand, each in inputs[:, :2]]
-    np.testing.assert_allclose(found, np.minimum(density, critical), rtol=1e-4, atol=1e-9)
-
-
-def test_without_weight_the_inputs_change_nothing():
-    episodes = simulate(n_steps=20)
-    one, other = (
-        started("asm", "compiled", episodes, smoothing(boundary_weight=0.0)) for _ in range(2)
-    )
-    run(one, episodes, range(20))
-    run(other, episodes, range(20), inputs=0.5 * episodes.inputs[0])
-    assert_same(show(one), show(other))
-
-
-def test_errors_that_are_larger_than_expected_raise_the_deviations():
-    """Where noise does not hide them: of the densities of half of the segments."""
-    rng = np.random.default_rng(0)
-    values = np.tile([45.0, 70.0], (300, 15, 1))
-    calm = on_a_road(300, True, values)
-    values[..., :8, 0] += 60.0 * rng.choice([-1.0, 1.0], (300, 8))
-    wild = on_a_road(300, True, values)
-    noise = replace(wild, sigma=np.full(wild.sigma.shape, 500.0))
-    found = []
-    for episodes in (calm, wild, noise):
-        smoother = started("asm", "compiled", episodes)
-        run(smoother, episodes, range(300))
-        found.append(np.sqrt(smoother.state.smoothed[0, :15, 0]))
-        found.append(smoother.estimate().density_std[0, :15])
-    expected, calm_std, base, wild_std, _, noise_std = found
-    np.testing.assert_allclose(calm_std, expected, rtol=1e-3)
-    assert (wild_std[:8] > 2.0 * base[:8]).all()
-    np.testing.assert_allclose(wild_std[8:11], base[8:11], rtol=0.5)
-    assert (noise_std > 15.0).all()

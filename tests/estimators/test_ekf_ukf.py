@@ -8,9 +8,7 @@ import pytest
 
 from dptse_env.estimators import (
     BACKENDS,
-    DemandSettings,
     EstimatorSettings,
-    SigmaPointSettings,
 )
 from dptse_env.estimators.simple import estimated_traffic
 from dptse_env.model.parameters import VACUUM
@@ -98,18 +96,6 @@ def test_backends_take_the_same_steps(name, release, bounds, settings):
     take_steps(name, episodes, replace(settings, bounds=bounds), tolerance, anew, again=7)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("release", ["speed", "flow"])
-def test_the_ukfs_agree_over_a_recorded_episode(release):
-    """At alpha 0.3 rounding dies out; with speeds it grows on the way, even between references.
-
-    How far depends on the processor.
-    """
-    take_steps("ukf", recorded(release), PLAIN)
-    settings = EstimatorSettings(ukf=SigmaPointSettings(alpha=0.3))
-    take_steps("ukf", recorded(release), settings, 1e-5, anew=False)
-
-
 @pytest.mark.parametrize("release", ["speed", "flow"])
 def test_the_ekfs_agree_over_a_recorded_episode_and_beat_walk_and_model(release):
     episodes, errors = recorded(release), {}
@@ -127,95 +113,7 @@ def test_the_ekfs_agree_over_a_recorded_episode_and_beat_walk_and_model(release)
 
 # Beside a Kalman filter in plain numpy ------------------------------------------------------------
 
-SEEN = {"a pair": [(4, 2)], "what overlaps": [(4, 2), (5, 3), (5, 1), (16, 1)]}
 # So little uncertainty that the model is linear within it.
-SMALL, STEP_NOISE, VEHICLE_NOISE = 1e-5, (2e-5, 1e-5), (5e-5, 3e-5)
-FACTOR, MEMORY = 1e-3, 50.0  # deviation and memory [s] of demand factors
-
-
-def derivative(function, x, scale):
-    """The Jacobian of a function of a state by central differences, both normalised by a scale."""
-    columns = []
-    for i in range(x.size):
-        change = 1e-5 * scale[i] * (np.arange(x.size) == i)
-        columns.append((function(x + change) - function(x - change)) / 2e-5)
-    return np.stack(columns, axis=-1)
-
-
-def textbook(model, name, x, inputs, values, sigma, centre, rows):
-    """Mean, covariance and innovations of a step, normalised; the UKF's gain leaves Q out."""
-    scale, v_f, S = model.state_scale, model.speed_scale, model.n_segments
-    unit = model.density_scale * np.array([1.0, v_f])
-    n_factors = model.n_states - 2 * S
-    variance = np.square([SMALL] * 2 * S + [FACTOR] * n_factors)
-    of_factors = FACTOR**2 * (1.0 - np.exp(-2.0 / MEMORY))
-    noise = np.diag([*np.tile(np.square(STEP_NOISE), S), *np.full(n_factors, of_factors)])
-    of_vehicles, of_psi = np.square(VEHICLE_NOISE)
-    for s, (rho, psi) in enumerate(x[: 2 * S].reshape(S, 2) / unit):
-        block = of_vehicles * np.outer([rho, psi], [rho, psi]) / rho + np.diag([0.0, of_psi * rho])
-        noise[2 * s : 2 * s + 2, 2 * s : 2 * s + 2] += block
-
-    def move(x):
-        return model.step(x[None], inputs[None])[0] / scale
-
-    def look(x):
-        rho, psi = x[0 : 2 * S : 2], x[1 : 2 * S : 2]
-        pressure = v_f * (rho / model.jam_density) ** model.parameters.gamma
-        flow, numbers = psi - rho * (pressure + centre), []
-        for first, span in rows:
-            inside = slice(first, first + span)
-            numbers += [rho[inside].sum() / span / unit[0], flow[inside].sum() / span / unit[1]]
-        return np.array(numbers)
-
-    F = derivative(move, x, scale)
-    mean, of_points = move(x), F @ np.diag(variance) @ F.T
-    covariance = of_points + noise
-    known = covariance if name == "ekf" else of_points
-    H = derivative(look, mean * scale, scale)
-    R = np.square(sigma / unit)
-    spread = H @ known @ H.T + np.diag(R.ravel())
-    residual = (values / unit).ravel() - look(mean * scale)
-    gain = known @ H.T @ np.linalg.inv(spread)
-    innovations = (residual / np.sqrt(np.diag(spread))).reshape(-1, 2)
-    return mean + gain @ residual, covariance - gain @ spread @ gain.T, innovations
-
-
-@both_filters
-@both_backends
-@pytest.mark.parametrize("seen", SEEN.values(), ids=SEEN.keys())
-def test_an_update_is_that_of_a_kalman_filter(name, backend, seen):
-    """On rows of several segments, with noise that grows with the density, and demand states."""
-    episodes = simulate(n_steps=1, release="rows")
-    settings = EstimatorSettings(
-        process_noise=STEP_NOISE,
-        vehicle_noise=VEHICLE_NOISE,
-        initial_variance=SMALL**2,
-        demand=DemandSettings(deviation=FACTOR, memory=MEMORY),
-    )
-    estimator = started(name, backend, episodes, settings)
-    model, rng = estimator.model, np.random.default_rng(2)
-    inputs, centre = episodes.inputs[0], episodes.centre[0]
-    x = np.concatenate([episodes.start[0], np.ones(3)])
-    ids = list(zip(model.channels.first.tolist(), model.channels.span.tolist(), strict=True))
-    places = [ids.index(row) for row in seen]
-    scale = SMALL * model.measurement_scale
-    sigma = scale * rng.uniform(0.5, 2.0, (1, model.channels.size, 2))
-    after = model.step(x[None], inputs)
-    values = model.measure(after, centre) + sigma * rng.normal(size=sigma.shape)
-    observed = np.zeros((1, model.channels.size), bool)
-    observed[:, places] = True
-
-    step(estimator, episodes, 0, observed=observed, values=values, sigma=sigma)
-    mean, covariance, innovations = textbook(
-        model, name, x, inputs[0], values[0, places], sigma[0, places], centre[0], seen
-    )
-    found, scale = estimator.states[0] / model.state_scale, model.state_scale
-    assert np.abs(mean - after[0] / scale).max() > 0.1 * SMALL
-    deviations = np.sqrt(np.diag(covariance))
-    gap = estimator.covariances[0] - covariance
-    assert np.abs((found - mean) / deviations).max() < 1e-3
-    assert np.abs(gap / np.outer(deviations, deviations)).max() < 1e-3
-    np.testing.assert_allclose(estimator.innovations[0, places], innovations, rtol=0.0, atol=1e-3)
 
 
 # Soundness ----------------------------------------------------------------------------------------

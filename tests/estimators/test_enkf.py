@@ -52,31 +52,7 @@ def test_it_takes_the_steps_of_its_reference(release, bounds, options):
     np.testing.assert_array_equal(compiled.innovations[~episodes.observed[24]], 0.0)
 
 
-@both_backends
-def test_what_is_measured_does_not_change_how_members_are_disturbed(backend):
-    episodes = simulate(n_steps=6)
-    seeing, blind = (started("enkf", backend, episodes) for _ in range(2))
-    for filters, share in ((seeing, episodes.observed[0]), (blind, np.zeros((1, 19), bool))):
-        run(filters, episodes, range(6), observed=share, sigma=np.array([1e13, 1e13]))
-    np.testing.assert_allclose(seeing.members, blind.members, rtol=1e-7)
-
-
 # Options ------------------------------------------------------------------------------------------
-
-
-def test_inflation_alone_scales_distances_from_the_mean():
-    """With worthless measurements and room to the bounds nothing else moves the members."""
-    episodes = simulate(n_steps=1)
-    settings = EstimatorSettings(
-        initial_variance=1e-8, bounds="box", enkf=EnsembleSettings(inflation=1.5)
-    )
-    filters = started("enkf", "compiled", episodes, settings)
-    before, covariances = filters.states, filters.covariances
-    update(filters, episodes, 0, observed=np.zeros((1, 19), bool))
-    np.testing.assert_array_equal(filters.covariances, covariances)
-    update(filters, episodes, 0, sigma=np.array([1e13, 1e13]))
-    np.testing.assert_allclose(filters.states, before, rtol=1e-9)
-    np.testing.assert_allclose(filters.covariances, 1.5**2 * covariances, rtol=1e-6)
 
 
 def test_a_tapered_row_acts_near_any_of_its_segments_and_on_the_factor_of_a_near_entry():

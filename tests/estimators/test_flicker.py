@@ -70,25 +70,6 @@ def test_a_channel_of_several_segments_has_the_flicker_of_its_length():
     assert three == pytest.approx((one - rounding) / 3.0 + rounding / 9.0)
 
 
-def test_a_mean_of_correlated_counts_scatters_as_if_each_had_the_variance():
-    """Vehicles of a Poisson process, all at one speed, counted every second for ten minutes."""
-    rng, speed, per_hour, length, seconds = np.random.default_rng(0), 90.0, 1800.0, 0.1, 600
-    n, times = per_hour / speed * length, np.arange(seconds)
-    means = []
-    for _ in range(400):
-        entered = np.sort(
-            rng.uniform(-10.0, seconds, rng.poisson(per_hour / 3600.0 * (seconds + 10)))
-        )
-        present = np.searchsorted(entered, times)
-        left = np.searchsorted(entered, times - 3600.0 * length / speed)
-        means.append((present - left).mean())
-    model = model_of("w99-3lane", "speed")
-    sparse = 1e-3  # at which nothing keeps vehicles apart
-    alike = deviations(model, uniform(model, sparse, speed), (1,))[0, 0] ** 2
-    alike /= deviations(model, uniform(model, sparse, speed))[0, 0] ** 2
-    assert np.var(means) == pytest.approx(alike * n / seconds, rel=0.2)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("corridor", [PAPER_HIGHWAY, SHORT_HIGHWAY], ids=lambda road: road.name)
 def test_recorded_counts_flicker_as_much(corridor):

@@ -16,7 +16,7 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel
-from tests.helpers import Stretch, pairwise
+from tests.helpers import pairwise, stretch
 from tests.model.oracle import PUBLISHED
 
 from .helpers import random_streams
@@ -42,7 +42,7 @@ class Sensor(NamedTuple):
 SENSORS = {
     # Below the density that a measurement takes at least, the speed is linear in psi.
     "speed": Sensor(
-        ARZModel(Stretch(n_mainline=1).road, PUBLISHED),
+        ARZModel(stretch(n_mainline=1).road, PUBLISHED),
         np.array([[1.0, 0.0], [0.0, 1.0 / FLOOR]]),
         np.array([0.0, -V_F * 0.01**2]),
         np.array([0.4, 6.0]),
@@ -50,7 +50,7 @@ SENSORS = {
     # Long segments, for the CFL condition; a pressure of (2 / 333)^10 is none.
     "flow": Sensor(
         ARZModel(
-            Stretch(n_mainline=1, segment_length=1.0).road,
+            stretch(n_mainline=1, segment_length=1.0).road,
             replace(PUBLISHED, gamma=10.0),
             centre=V_0,
         ),

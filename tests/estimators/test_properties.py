@@ -5,7 +5,6 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -18,7 +17,7 @@ from dptse_env.estimators import (
     make_estimator,
 )
 from dptse_env.model import ARZModel
-from tests.helpers import Stretch, fast_and_slow
+from tests.helpers import fast_and_slow, stretch
 from tests.model.oracle import PUBLISHED
 
 from .helpers import (
@@ -28,7 +27,6 @@ from .helpers import (
     RICH,
     Snapshot,
     assert_same,
-    every_channel,
     model_of,
     random_streams,
     recorded,
@@ -38,7 +36,6 @@ from .helpers import (
     started,
     step,
     update,
-    with_channels,
 )
 
 # Each compiled one is compared with its reference in a module of its own: the references, and the
@@ -100,26 +97,21 @@ def test_every_name_and_backend_follows_the_protocol(name, backend):
             assert np.isfinite(a).all()
             assert not np.shares_memory(a, b)
             assert (a >= 0.0).all()
-        with pytest.raises(ValueError, match=r"states must have shape \(1, 38\), got \(1, 37\)"):
+        with pytest.raises(ValueError, match=r"^states must .* got \(1, 37\)"):
             estimator.reset(everyone[:1], np.zeros((1, 37)), random_streams(1))
-        with pytest.raises(ValueError, match=r"inputs must have shape \(1, 9\), got \(9,\)"):
+        with pytest.raises(ValueError, match=r"^inputs must .* got \(9,\)"):
             estimator.predict(everyone[:1], np.zeros(9))
 
 
 def test_unknown_names_say_what_is_allowed():
     for name, backend, n, message in (
-        ("kf", "compiled", 1, r"estimator must be one of ekf, .*, asm, or.*, got 'kf'"),
-        ("ekf", "torch", 1, "backend must be one of compiled, reference, got 'torch'"),
-        ("ekf", "compiled", 0, "n_episodes must be >= 1, got 0"),
+        ("kf", "compiled", 1, r"^estimator must be .*, got 'kf'"),
+        ("ekf", "torch", 1, "^backend must be .*, got 'torch'"),
+        ("ekf", "compiled", 0, "^n_episodes must be .*, got 0"),
+        *((name, "reference", 1, "^backend must be") for name in {*ESTIMATORS} - {*REFERENCES}),
     ):
         with pytest.raises(ValueError, match=message):
             make_estimator(name, backend, MODEL, n)
-    for name in set(ESTIMATORS) - set(REFERENCES):
-        message = rf"must be 'compiled' for '{name}', only {', '.join(REFERENCES)} have a reference"
-        with pytest.raises(ValueError, match=message):
-            make_estimator(name, "reference", MODEL, 1)
-        with pytest.raises(ValueError, match=message):
-            gym.make("dptse_env:dptse/ShortHighway-v0", estimator=name, backend="reference")
 
 
 def test_the_library_of_reference_filters_is_imported_for_these_alone():
@@ -138,33 +130,28 @@ for backend in ("compiled", "reference"):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"observed": np.zeros((2, 4), bool)}, r"observed .* \(k, 5\), got \(2, 4\)"),
-        ({"values": np.zeros((2, 5))}, r"values .* \(2, 5, 2\), got \(2, 5\)"),
-        ({"sigma": np.ones(3)}, r"sigma .* \(2, 5, 2\) .*, got \(3,\)"),
+        ({"observed": np.zeros((2, 4), bool)}, r"observed .* got \(2, 4\)"),
+        ({"values": np.zeros((2, 5))}, r"values .* got \(2, 5\)"),
+        ({"sigma": np.ones(3)}, r"sigma .* got \(3,\)"),
         ({"sigma": np.array([[1.0, 1.0]] * 4 + [[1.0, -2.0]])}, "sigma must be finite and >= 0"),
-        ({"centre": np.ones((2, 4))}, r"centre .* \(2, 5\) .*, got \(2, 4\)"),
+        ({"centre": np.ones((2, 4))}, r"centre .* got \(2, 4\)"),
         ({"centre": np.full(5, np.nan)}, "centre must be finite"),
     ],
 )
 def test_bad_measurements_are_named(changes, message):
-    good = {
-        "observed": np.ones((2, 5), bool),
-        "values": np.zeros((2, 5, 2)),
-        "sigma": np.ones(2),
-        "centre": np.ones(5),
-    }
-    model = ARZModel(Stretch(n_mainline=5).road, PUBLISHED, centre=50.0)
+    good = {"observed": np.ones((2, 5), bool), "values": np.zeros((2, 5, 2)), "sigma": np.ones(2)}
+    model = ARZModel(stretch(n_mainline=5).road, PUBLISHED, centre=50.0)
     with pytest.raises(ValueError, match=message):
         Measurement.of(model, **{**good, **changes})
 
 
 def test_what_a_measurement_leaves_out_is_filled_in_and_boundary_columns_are_left_out():
     observed, values, sigma = np.ones((2, 5), bool), np.zeros((2, 5, 2)), np.array([3.0, 4.0])
-    flows = ARZModel(Stretch(n_mainline=5).road, PUBLISHED, centre=50.0)
+    flows = ARZModel(stretch(n_mainline=5).road, PUBLISHED, centre=50.0)
     given = Measurement.of(flows, observed, values, sigma)
     np.testing.assert_array_equal(given.sigma, np.broadcast_to(sigma, (2, 5, 2)))
     np.testing.assert_array_equal(given.centre, np.full((2, 5), 50.0))
-    speeds = ARZModel(Stretch(n_mainline=5).road, PUBLISHED)
+    speeds = ARZModel(stretch(n_mainline=5).road, PUBLISHED)
     given = Measurement.of(speeds, observed, values, sigma, np.full(5, 7.0))
     assert np.isnan(given.centre).all()  # speeds have no centre
     more = np.ones((2, 7), bool), np.ones((2, 7, 2)), np.ones((2, 7, 2)), np.ones((2, 6))
@@ -176,24 +163,17 @@ def test_what_a_measurement_leaves_out_is_filled_in_and_boundary_columns_are_lef
 
 
 @over()
-def test_the_seed_decides_and_the_global_generator_is_left_alone(name, backend, release):
-    n_steps = steps_of(name, backend, 50)
+def test_the_seed_decides_in_every_episode(name, backend, release):
+    n_steps = steps_of(name, backend, 20)
     episodes = simulate(n_steps=n_steps, release=release)
-    first, second = (started(name, backend, episodes) for _ in range(2))
-    np.random.seed(1)  # noqa: NPY002
-    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    first, other = (started(name, backend, episodes, seed=seed) for seed in (0, 1))
+    for estimator in (first, other):
+        run(estimator, episodes, range(n_steps))
+    found, draws = show(first), name == "enkf"
+    assert np.array_equal(found.density, show(other).density) != draws
+    first.reset(episodes.everyone, episodes.start, random_streams(1))
     run(first, episodes, range(n_steps))
-    np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
-    np.random.seed(2)  # noqa: NPY002
-    run(second, episodes, range(n_steps))
-    assert_same(show(first), show(second))
-    second.reset(episodes.everyone, episodes.start, random_streams(1))
-    run(second, episodes, range(n_steps))
-    assert_same(show(first), show(second))
-    third = started(name, backend, episodes, seed=1)
-    run(third, episodes, range(n_steps))
-    draws = name == "enkf"
-    assert np.array_equal(show(first).density, show(third).density) != draws
+    assert_same(show(first), found)
 
 
 REMEMBERING = [case for case in CASES if case[1] == "compiled"]
@@ -217,12 +197,6 @@ def test_an_episode_goes_on_from_what_was_kept_of_it(name, backend, release):
     assert_same(show(estimator), once)
     assert_same(show(alone), once, which, which)
     assert not np.array_equal(show(alone).density[1], once.density[1])
-
-
-def test_who_does_not_say_what_it_remembers_is_named():
-    for name in REFERENCES:
-        with pytest.raises(ValueError, match=r"must have _memory .*, got .*:Reference"):
-            _ = make_estimator(name, "reference", MODEL, 1).memory
 
 
 # Soundness ----------------------------------------------------------------------------------------
@@ -349,26 +323,6 @@ def test_the_noise_is_as_large_as_the_settings_say(name, backend, release):
     run(given, replace(episodes, sigma=episodes.sigma * np.array([2.0, 0.5])), range(12))
     run(scaled, episodes, range(12))
     assert_same(show(given), show(scaled))
-
-
-@over(fast=[("mhe", "compiled", "flow") if case[0] == "mhe" else case for case in FAST],
-      cases=[case for case in CASES if case[2] == "flow"])  # fmt: skip
-def test_channels_that_nobody_measures_change_nothing(name, backend, release):
-    """Nor does the order of channels, but for the draws of the EnKF."""
-    plain = simulate(n_steps=12, release=release)
-    order = np.random.default_rng(3).permutation(19) if name != "enkf" else np.arange(19)
-    channels = every_channel(19, 15)
-    channels.first[order], channels.span[order] = channels.first[:19].copy(), 1
-    among = with_channels(plain, channels, order)
-    a, b = started(name, backend, plain), started(name, backend, among)
-    run(a, plain, range(12))
-    run(b, among, range(12))
-    for field in Snapshot._fields:
-        mine, its = getattr(show(a), field), getattr(show(b), field)
-        if field == "innovations":
-            np.testing.assert_array_equal(its[:, 19:], 0.0)
-            its = its[:, order]
-        np.testing.assert_allclose(its, mine, rtol=1e-7, atol=1e-9, err_msg=field)
 
 
 # Batches ------------------------------------------------------------------------------------------

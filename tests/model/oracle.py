@@ -10,7 +10,7 @@ import numpy as np
 from dptse_env.model import ARZModel, load_parameters
 from dptse_env.model.parameters import STANDING, VACUUM
 from dptse_env.utils.arrays import FloatArray
-from tests.helpers import UNEVEN, Stretch, make_channels
+from tests.helpers import UNEVEN, make_channels, stretch
 
 PUBLISHED = load_parameters("published")
 W99 = load_parameters("w99-3lane")
@@ -19,10 +19,10 @@ NO_RELAXATION = replace(PUBLISHED, name="no relaxation", relaxation_time=float("
 CHANNELS = make_channels((0, 3, 4, 13, 16), (1, 2, 3, 2, 1))
 """Channels of the highway, of one to three segments."""
 
-HIGHWAY = Stretch(on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
-STRAIGHT = Stretch()
+HIGHWAY = stretch(on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
+STRAIGHT = stretch()
 # Every kind of face beside every other, an off-ramp that nobody takes, and wider roads outside.
-CROWDED = Stretch(
+CROWDED = stretch(
     on_ramps=(3, 5), off_ramps=(4, 6), exit_shares=(0.0, 0.5), ramp_lanes=3, more_outside=1
 )
 ROADS = {
@@ -30,7 +30,7 @@ ROADS = {
     "uneven": UNEVEN,
     "crowded": CROWDED,
     "straight": STRAIGHT,
-    "one cell": Stretch(n_mainline=1),
+    "one cell": stretch(n_mainline=1),
 }
 
 

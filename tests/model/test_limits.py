@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dptse_env.model import ARZModel
-from tests.helpers import UNEVEN, Stretch, pairwise
+from tests.helpers import UNEVEN, pairwise, stretch
 
 from .oracle import (
     HIGHWAY,
@@ -65,7 +65,7 @@ def exact(left, right, xi):
 def errors(left, right, n):
     """Mean errors of density and flow, as shares of the jam density and of v_f rho_m / 4."""
     length = 4.0 / n
-    road = Stretch(n_mainline=n, segment_length=length)
+    road = stretch(n_mainline=n, segment_length=length)
     model = ARZModel(road.road, NO_RELAXATION, 0.5 * 1.76 * length / 0.1)
     x = (np.arange(n) + 0.5) * length - 2.0
     rho, speed = np.where(x[:, None] < 0.0, left, right).T[:, None]
