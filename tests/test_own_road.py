@@ -139,16 +139,6 @@ def test_what_lies_beyond_the_card_of_weights_is_told_once(name, keywords, value
         assert f"not {value};" in said
 
 
-@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
-def test_of_several_environments_python_tells_once(mode, tmp_path):
-    settings = weights_settings(tmp_path, **KNOWN)
-    given = {"estimator": "recurrent", "estimator_settings": settings, "epsilon": 100.0}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("default")
-        gym.make_vec(ID, num_envs=3, vectorization_mode=mode, traffic_seeds=[0], **given)
-    assert sum("epsilon 0.5 to 20, not 100" in str(each.message) for each in caught) == 1
-
-
 @pytest.mark.parametrize(("name", "keywords", "value"), BEYOND)
 def test_a_stream_beyond_the_card_of_weights_is_told_once(name, keywords, value, tmp_path):
     if name in ("span", "epsilon", "connected"):

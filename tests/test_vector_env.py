@@ -73,9 +73,10 @@ def test_autoreset_is_that_of_gymnasium(mode, truth_in_info):
     "estimator", fast_and_slow(ESTIMATORS, ["ekf", "enkf", "mhe", "recurrent"])
 )
 def test_threads_change_nothing(estimator):
-    n = 3 * SMALLEST_BLOCK
-    one, two = (make_batch(n, estimator=estimator, threads=threads) for threads in (1, 2))
-    assert_same(one.reset(seed=5), two.reset(seed=5))
+    """Nor where all episodes go through an interval of loops again."""
+    n, given = 3 * SMALLEST_BLOCK, {"loops": {"positions": [0.3], "interval": 10}}
+    one, two = (make_batch(n, threads=t, estimator=estimator, **given) for t in (1, 2))
+    assert_same(*(each.reset(seed=5, options={"start": 4}) for each in (one, two)))
     one.action_space.seed(1)
     for _ in range(8):
         actions = one.action_space.sample()

@@ -289,6 +289,21 @@ def test_vehicles_that_share_an_id_at_one_time_are_told_apart(shuffled, tmp_path
     assert "| 4 | ids of several vehicles at one time, told apart by their positions; " in text
 
 
+def test_vehicles_that_share_an_id_may_have_times_that_alternate(tmp_path):
+    points = stream(headway=8.0)
+    late = points[:, 0] % 2 == 1
+    points[late] += np.array([0.0, 0.05, 1.0, 0.0])  # 50 ms later, where they are then
+    expected = run(plain(tmp_path / "a.csv", points))
+    shared = points.copy()
+    shared[:, 0] //= 2
+    imported = run(plain(subfolder(tmp_path, "shared"), shared))
+    assert first_file(imported)["ids_shared"] == 8  # the last vehicle is alone
+    for seed in (0, 1):
+        one, other = record_of(imported, seed), record_of(expected, seed)
+        np.testing.assert_array_equal(one.counts, other.counts)
+        np.testing.assert_allclose(one.speed_sums, other.speed_sums)
+
+
 def test_rows_off_the_road_are_dropped_and_counted(tmp_path):
     points = stream()
     lane = np.where(points[:, 0] == 3, 9, 1)

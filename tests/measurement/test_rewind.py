@@ -254,6 +254,19 @@ def test_episodes_of_a_batch_begin_again_within_intervals(mode, estimator, actio
     lock_step({**given, "truth_in_info": True}, 20, autoreset_mode=mode)
 
 
+def test_nothing_is_left_of_an_episode_that_began_anew():
+    """Of the interval that a reset ends, and of the one that it begins in, told of twice."""
+    used, fresh = (begun(privacy=PAID, loops=LOOPS | {"interval": 2 * T}) for _ in range(2))
+    actions = sampled(used, 40)
+    for action in actions[:17]:
+        used.step(ALL, action)
+    generators = [np.random.default_rng(seed) for seed in SEEDS]
+    used.reset(ALL, generators, STARTS)
+    for action in actions[17:]:
+        here, there = used.step(ALL, action), fresh.step(ALL, action)
+        np.testing.assert_array_equal(here.observation, there.observation)
+
+
 # --- copies ---------------------------------------------------------------------------------------
 
 
