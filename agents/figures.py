@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
@@ -24,13 +25,13 @@ from dptse_env.utils.files import replacing
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666")
 """Okabe and Ito's, which the colour-blind can tell apart, and a grey."""
-WIDTH = 7.2
-"""Largest width of a figure [inches]: its texts of 8 points are read at 700 pixels."""
+WIDTH = 4.6
+"""Largest width of a figure [inches]: its texts of 8 points are read on a phone."""
 INK, GREY, GRID_COLOUR = "#1b2a41", "#333333", "#e3e6ea"
 ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 700, 1000)
 
 
-def make_figure(width: float, height: float, dpi: int = 140) -> Figure:
+def make_figure(width: float, height: float, dpi: int = 160) -> Figure:
     """Return an empty figure [inches] that lays out its axes without overlaps.
 
     One that is too wide is made narrower, and up to a fifth lower.
@@ -65,26 +66,27 @@ def add_frame(axis: Axes, lines: Literal["both", "x", "y"] = "both") -> None:
     axis.tick_params(labelsize=8)
 
 
-def finish_figure(figure: Figure, columns: int = 5) -> Figure:
+def finish_figure(figure: Figure) -> Figure:
     """Frame all panels, and name their curves below them."""
     for axis in figure.axes:
         add_frame(axis)
-    add_legend(figure, figure.axes, columns)
+    add_legend(figure, figure.axes)
     return figure
 
 
-def add_legend(figure: Figure, axes: Iterable[Axes], columns: int = 5) -> None:
-    """Name each label of some axes once below all panels."""
+def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
+    """Name each label of some axes once below all panels, in as many columns as fit."""
     named: dict[str, Any] = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
             named.setdefault(label, handle)
     if named:
+        columns = int(16 * figure.get_figwidth() / (max(map(len, named)) + 6))
         figure.legend(
             list(named.values()),
             list(named),
             loc="outside lower center",
-            ncols=min(len(named), columns),
+            ncols=max(1, min(len(named), columns)),
             frameon=False,
             fontsize=8,
         )
@@ -121,6 +123,10 @@ def draw_dot(axis: Axes, interval: Interval, place: float, colour: str, label: s
     )  # fmt: skip
 
 
+LONG_NAME = 24
+"""Letters of a row's name beyond which panels stand below one another."""
+
+
 def draw_errors(
     rows: Sequence[str],
     series: Mapping[str, Mapping[str, Mapping[str, Interval]]],
@@ -135,19 +141,21 @@ def draw_errors(
     """
     most = max(sum(row in each for each in series.values()) for row in rows)
     panels = list(next(each[row] for each in series.values() for row in rows if row in each))
-    # A single panel is as narrow as a phone.
-    width = WIDTH - 1.4 * max(3 - len(panels), 0)
-    figure = make_figure(width, 1.1 + (0.18 + 0.12 * most) * len(rows), dpi=160)
-    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    n_columns = min(len(panels), 1 if max(map(len, rows)) > LONG_NAME else 2)
+    n_lines = math.ceil(len(panels) / n_columns)
+    figure = make_figure(WIDTH, n_lines * (0.9 + (0.18 + 0.12 * most) * len(rows)) + 0.2)
+    axes = list(figure.subplots(n_lines, n_columns, sharey=True, squeeze=False).flat)
+    for axis in axes[len(panels) :]:
+        axis.remove()
     axes[0].set_yticks([-place for place in range(len(rows))], rows)
     colours = dict(zip(series, cycle(COLOURS), strict=False))
-    for axis, panel in zip(axes, panels, strict=True):
+    for axis, panel in zip(axes, panels, strict=False):
         for place, row in enumerate(rows):
             own = {name: each[row][panel] for name, each in series.items() if row in each}
             for k, (name, interval) in enumerate(own.items()):
                 shift = ((len(own) - 1) / 2 - k) * 0.3
                 draw_dot(axis, interval, shift - place, colours[name], name)
-        axis.set_xlabel(fill(panel, 72 // len(panels)), fontsize=9)
+        axis.set_xlabel(fill(panel, 48 // n_columns), fontsize=9)
         if log:
             set_log(axis, ERROR_TICKS)
         axis.margins(x=0.2)
@@ -183,19 +191,15 @@ def estimate_map(history: History, rmse: float, title: str) -> RoadMap:
     return RoadMap(title, history.estimate, history)
 
 
-def draw_maps(
-    columns: Sequence[Sequence[RoadMap]], width: float, height: float = 1.25, dpi: int = 140
-) -> Figure:
+def draw_maps(columns: Sequence[Sequence[RoadMap]], height: float = 1.1) -> Figure:
     """Draw panels over space and time with one colour bar for all densities.
 
     Args:
         columns: Panels of each column from top to bottom; rows have one kind of panel.
-        width: Width of the figure [inches].
         height: Height of a panel of densities [inches].
-        dpi: Points for an inch.
     """
     ratios = [height * (0.6 if panel.is_flags else 1.0) for panel in columns[0]]
-    figure = make_figure(width, sum(ratios) + 1.2, dpi)
+    figure = make_figure(WIDTH, sum(ratios) + 1.2)
     axes = figure.subplots(
         len(ratios), len(columns), squeeze=False, sharex=True, sharey=True,
         gridspec_kw={"height_ratios": ratios},
@@ -206,8 +210,7 @@ def draw_maps(
             if not panel.is_flags:
                 densities = image
         axes[-1, k].set_xlabel("time [s]", fontsize=8)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("road [km]", fontsize=8)
+    figure.supylabel("road [km]", fontsize=8)
     bar = figure.colorbar(
         densities, ax=axes.ravel().tolist(), fraction=0.02, pad=0.01, extend="max"
     )
@@ -218,7 +221,7 @@ def draw_maps(
 
 def _draw_map(axis: Axes, panel: RoadMap, n_columns: int) -> AxesImage:
     values = np.array(panel.seconds).T[panel.history.rows]
-    axis.set_title(fill(panel.title, 88 // n_columns), loc="left", fontsize=9, pad=3, color=INK)
+    axis.set_title(fill(panel.title, 56 // n_columns), loc="left", fontsize=9, pad=3, color=INK)
     axis.tick_params(labelsize=8)
     return axis.imshow(
         values,

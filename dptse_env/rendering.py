@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from dptse_env.release import RELEASE_MODELS
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from dptse_env.utils.registry import needed_for
 
@@ -42,7 +43,7 @@ class History:
         estimate: Estimated mainline densities [veh/km], an array (n_mainline,) per second.
         queried: Segments that a query covered, flags (n_mainline,) per second.
         rmse: Density error over the mainline [veh/km], a number per second.
-        title: Id or road, estimator and bandwidth in words.
+        title: Id or road, estimator, release model and bandwidth in words.
         loops: Places of stations of loops along the mainline [km].
     """
 
@@ -75,7 +76,10 @@ class History:
         often = "a second" if every == 1 else f"in {every} s"
         unit = "sums" if is_sums else f"of {len(lengths)} segments"
         place = name.rpartition("/")[2] or corridor.name
-        title = f"{place}, estimator {estimator}, queries {config.bandwidth} {unit} {often}"
+        losses = f"ε {config.privacy.epsilon:g}, δ {config.privacy.delta:g}"
+        release = f"{RELEASE_MODELS.name_of(config.privacy.preset)} ({losses})"
+        queries = f"queries {config.bandwidth} {unit} {often}"
+        title = f"{place}, estimator {estimator}, release {release},\n{queries}"
         scale = corridor.scales.density_scale
         loops = tuple(corridor.stations.positions.tolist())
         return cls(episode, config.horizon_steps, lengths, scale, title=title, loops=loops)
@@ -115,7 +119,7 @@ class Picture:
         from matplotlib.colors import ListedColormap  # noqa: PLC0415
         from matplotlib.figure import Figure  # noqa: PLC0415
 
-        figure = Figure(figsize=(7.2, 8.0), dpi=100, layout="constrained")
+        figure = Figure(figsize=(5.0, 6.4), dpi=144, layout="constrained")
         self._canvas: Any = FigureCanvasAgg(figure)
         axes = figure.subplots(5, 1, gridspec_kw={"height_ratios": [2.6, 3, 3, 2.6, 1.6]})
         figure.suptitle(history.title, x=0.01, ha="left", fontsize=10)
@@ -145,7 +149,7 @@ class Picture:
             axis.set_ylabel("position [km]", fontsize=8)
             axis.tick_params(labelbottom=False)
         # Titles that change from second to second.
-        self._now = axes[0].set_title(" ", loc="left", fontsize=9, pad=3)
+        self._now = axes[0].set_title(" ", loc="left", fontsize=9, pad=17)  # above the legend
         self._rmse = axes[4].set_title(" ", loc="left", fontsize=9, pad=3)
         bar = figure.colorbar(
             self._maps[0], ax=axes.tolist(), fraction=0.03, pad=0.02, extend="max",
@@ -187,10 +191,10 @@ class Picture:
         axis.set(xlim=(0.0, edges[-1]), ylim=(0.0, top))
         axis.set_xlabel("position along the road [km]", fontsize=8)
         axis.set_ylabel("[veh/km]", fontsize=8)
-        place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderaxespad": 0.0}
-        if history.loops:  # one entry more beside the title
-            place |= {"columnspacing": 1.0, "handlelength": 1.2}
-        axis.legend(ncols=4, frameon=False, fontsize=8, **place)
+        axis.legend(
+            ncols=4, frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 0.97),
+            borderaxespad=0.0, columnspacing=1.0, handlelength=1.2,
+        )  # fmt: skip
 
     def draw(self, history: History) -> NDArray[np.uint8]:
         """Return the picture of ``history`` as RGB, shape (height, width, 3)."""
@@ -346,7 +350,7 @@ class Screen:
                 f"render_mode='human' needs a display, and none can be opened ({problem}): use "
                 "render_mode='rgb_array', or gymnasium.wrappers.RecordVideo for a video"
             ) from problem
-        pygame.display.set_caption(self._title)
+        pygame.display.set_caption(self._title.replace("\n", " "))
         return surface
 
     def close(self) -> None:

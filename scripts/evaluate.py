@@ -375,7 +375,7 @@ def draw_traffic(args: Args, title: str, scores: Sequence[Score], cells: Sequenc
     for each in episodes:
         maps.append(estimate_map(each.history, each.row[DENSITY], f"{each.name}: estimate"))
         maps.append(RoadMap(f"{each.name}: queried", each.history.queried, each.history))
-    figure = draw_maps([maps], width=8.4)
+    figure = draw_maps([maps])
     save_figure(figure, args.output / MAPS, f"{title}: seed {seed}, {own[0].estimator}")
     if args.html:
         table = make_rows(own, args.reference)

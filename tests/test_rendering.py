@@ -43,7 +43,10 @@ def test_a_picture_shows_the_episode_so_far():
         play(env, 20, seed)
         picture = env.render()
     texts = [text.get_text() for text in env.unwrapped.drawing._picture._canvas.figure.texts]
-    assert texts == ["ShortHighway-v0, estimator ekf, queries 2 of 6 segments a second"]
+    assert texts == [
+        "ShortHighway-v0, estimator ekf, release printed (ε 1, δ 0.05),\n"
+        "queries 2 of 6 segments a second"
+    ]
     assert (picture.dtype, picture.shape) == (np.uint8, empty.shape)
     assert (picture != empty).mean() > 0.05
     # A figure that is used again shows what a new one does.

@@ -205,7 +205,7 @@ def draw_diagram(
     axis.set_xlabel("density of a lane [veh/km]", fontsize=8)
     axis.set_ylabel("speed [km/h]", fontsize=8)
     axis.set_ylim(0.0, 1.15 * float(speed.max()))
-    return finish_figure(figure, columns=1)
+    return finish_figure(figure)
 
 
 def draw_episode(choice: Choice, seed: int) -> Figure:
@@ -218,4 +218,4 @@ def draw_episode(choice: Choice, seed: int) -> Figure:
         estimate_map(history, episode.row[DENSITY], f"estimate of {choice.estimator}"),
         RoadMap(f"queried by {choice.policy}", history.queried, history),
     ]
-    return draw_maps([panels], WIDTH)
+    return draw_maps([panels])

@@ -29,6 +29,7 @@ from agents.environments import (
 from agents.figures import (
     ERROR_TICKS,
     LABELS,
+    WIDTH,
     Look,
     draw_curve,
     draw_errors,
@@ -405,15 +406,15 @@ def draw_elsewhere(rows: pl.DataFrame) -> Figure:
 
 def draw_arms(rows: pl.DataFrame) -> Figure:
     """Draw the error of both kinds of sensors, and of either alone, against the share."""
-    figure = make_figure(11.0, 6.0, dpi=100)
-    axes = figure.subplots(2, len(RELEASES), sharex=True, sharey="row")
+    figure = make_figure(WIDTH, 7.6)
+    axes = figure.subplots(len(RELEASES), 2, sharex=True, sharey="col")
     percent = [100.0 * share for share in SHARES.values()]
     arms = {
         "queries and fixed sensors": (BOTH, Look("#d55e00", "s")),
         "queries alone": (QUERIES, Look("#0072b2", "o", "--")),
     }
-    for axis, pair in zip(axes.flat, product((EKF, LEARNED), RELEASES), strict=True):
-        estimator, release = pair
+    for axis, pair in zip(axes.flat, product(RELEASES, (EKF, LEARNED)), strict=True):
+        release, estimator = pair
         level = mean(rows, alone(release, estimator), ERROR)
         draw_level(axis, level, label="fixed sensors alone, with the whole budget")
         for name, (arm, look) in arms.items():

@@ -23,6 +23,7 @@ from agents.environments import GUARANTEE, PRIVATE, guarantee_of
 from agents.figures import (
     ERROR_TICKS,
     LABELS,
+    WIDTH,
     Look,
     draw_curve,
     draw_errors,
@@ -384,7 +385,7 @@ LOOKS = {
 
 def draw_price(rows: pl.DataFrame) -> Figure:
     """Draw errors against epsilon for every protection and estimator."""
-    figure = make_figure(9.4, 7.0, dpi=120)
+    figure = make_figure(WIDTH, 6.0)
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
     for axis, (metric, name) in zip(axes.flat, product(METRICS, ESTIMATORS), strict=True):
         for protection, look in LOOKS.items():

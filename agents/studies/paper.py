@@ -33,6 +33,7 @@ from agents.figures import (
     ERROR_TICKS,
     ESTIMATOR_LOOKS,
     LABELS,
+    WIDTH,
     Look,
     RoadMap,
     draw_curve,
@@ -92,7 +93,6 @@ N_TIMED = 10
 MAP_SEGMENTS, MAP_STEP = 7, 5
 """CV segments of result 2, and seconds between two columns of its maps."""
 RUN_TIME, SPACE_TIME = "run_time.parquet", "space_time.parquet"
-DPI = 90
 SETTINGS = {
     f"{privacy} noise, {parameters} parameters": {"parameters": parameters, "privacy": privacy}
     for privacy, parameters in itertools.product(
@@ -444,12 +444,12 @@ def tables_of(rows: pl.DataFrame) -> str:
     return "\n\n".join(text)
 
 
-def draw_sweep(rows: pl.DataFrame, field: str, metrics: Sequence[str], columns: int) -> Figure:
+def draw_sweep(rows: pl.DataFrame, field: str, metrics: Sequence[str]) -> Figure:
     """Draw errors along a sweep, a panel for each metric and setting."""
     panels = list(itertools.product(metrics, SETTINGS))
-    n_rows = len(panels) // columns
-    figure = make_figure(2.0 * columns + 4.4, 2.7 * n_rows + 0.8, DPI)
-    for axis, panel in zip(figure.subplots(n_rows, columns).flat, panels, strict=True):
+    n_rows = len(panels) // 2
+    figure = make_figure(WIDTH, 2.1 * n_rows + 0.6)
+    for axis, panel in zip(figure.subplots(n_rows, 2).flat, panels, strict=True):
         metric, setting = panel
         (alone,) = curves_of(rows, setting, Curve("open_loop", metric))
         lines = (*setting.split(", "), error_label(metric), f"open loop: {alone.mean():.1f}")
@@ -461,7 +461,7 @@ def draw_sweep(rows: pl.DataFrame, field: str, metrics: Sequence[str], columns: 
             draw_curve(axis, places, means, ESTIMATOR_LOOKS[name], LABELS[name])
         axis.set_xlabel(AXES[field])
         if field != "bandwidth":
-            set_log(axis, SWEEPS[field], ERROR_TICKS if field == "epsilon" else ())
+            set_log(axis, SWEEPS[field][::2], ERROR_TICKS if field == "epsilon" else ())
     return finish_figure(figure)
 
 
@@ -481,12 +481,13 @@ def draw_space_time(table: pl.DataFrame) -> Figure:
             for title, content in maps.items():
                 column.append(RoadMap(title, np.array(row[content]), history, MAP_STEP))
         columns.append(column)
-    return draw_maps(columns, width=10.4, height=0.7, dpi=90)
+    # Two settings below one another: four columns are too narrow for a phone.
+    return draw_maps([columns[0] + columns[1], columns[2] + columns[3]], height=0.5)
 
 
 def draw_times(rows: pl.DataFrame) -> Figure:
     """Draw the time of a step beside the paper's."""
-    figure = make_figure(6.4, 3.9, DPI)
+    figure = make_figure(WIDTH, 3.6)
     axis = figure.subplots()
     places = np.arange(len(ESTIMATORS))
     for k, setting in enumerate(SETTINGS):
@@ -497,24 +498,24 @@ def draw_times(rows: pl.DataFrame) -> Figure:
         draw_curve(axis, places + 0.16 * (k - 1.5), times, look, f"here, {setting}")
     for place, name in enumerate(PAPER_SECONDS):
         axis.plot(place, 1e3 * PAPER_SECONDS[name], "kx", label="the paper")
-    axis.set_xticks(places, [LABELS[name] for name in ESTIMATORS])
+    axis.set_xticks(places, [LABELS[name].replace(" ", "\n") for name in ESTIMATORS])
     set_log(axis, y=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0))
     axis.set_ylabel("time of a step [ms]")
-    return finish_figure(figure, columns=2)
+    return finish_figure(figure)
 
 
 def report(rows: pl.DataFrame, folder: Path) -> str:
     """Return the tables, and draw the figures."""
     rows = with_times(rows, read_table(folder / RUN_TIME, (*CELLS[0].labels, SECONDS)))
     maps = read_table(folder / SPACE_TIME, ("truth", "estimate"))
-    for name, field, metrics, columns in (
-        ("fig1_cv_segments.png", "bandwidth", (DENSITY, SPEED), 4),
-        ("fig3_epsilon.png", "epsilon", (DENSITY,), 2),
-        ("fig4_delta.png", "delta", (DENSITY,), 2),
+    for name, field, metrics in (
+        ("fig1_cv_segments.png", "bandwidth", (DENSITY, SPEED)),
+        ("fig3_epsilon.png", "epsilon", (DENSITY,)),
+        ("fig4_delta.png", "delta", (DENSITY,)),
     ):
         fixed = ", ".join(f"{AXES[key]} = {BASE[key]:g}" for key in AXES if key != field)
         title = f"Error against {AXES[field]}; {fixed}"
-        save_measured(folder / name, title, draw_sweep, rows, field, metrics, columns)
+        save_measured(folder / name, title, draw_sweep, rows, field, metrics)
     title = f"Density, and estimates from {MAP_SEGMENTS} CV segments with their RMSE [veh/km]"
     save_measured(folder / "fig2_space_time.png", title, draw_space_time, maps)
     title = "Time of predict, update and estimate, one episode at a time"

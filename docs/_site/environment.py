@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from agents.figures import (
     COLOURS,
     ERROR_TICKS,
+    WIDTH,
     Look,
     add_frame,
     draw_curve,
@@ -62,22 +63,24 @@ def draw_estimators() -> Figure:
     Over roads it is the mean, with the interval over the traffic seeds that they share.
     """
     found = {
-        "PrivateHighway-v1\n(simulated)": on_private_highway(rows_of("estimators")),
-        "fourteen other roads\n(simulated)": on_other_roads(rows_of("roads")),
-        "US-101\n(measured)": on_measured_road(),
+        "PrivateHighway-v1 (simulated)": on_private_highway(rows_of("estimators")),
+        "fourteen other roads (simulated)": on_other_roads(rows_of("roads")),
+        "US-101 (measured)": on_measured_road(),
     }
-    figure = make_figure(7.0, 3.6, dpi=160)
-    axes = figure.subplots(1, len(found), sharey=True)
+    names = {where: [each for each in ESTIMATORS if each in own] for where, own in found.items()}
+    counts = [len(each) for each in names.values()]
+    figure = make_figure(WIDTH, 5.6)
+    axes = figure.subplots(len(found), 1, sharex=True, gridspec_kw={"height_ratios": counts})
     for axis, (title, errors) in zip(axes, found.items(), strict=True):
-        for place, name in enumerate(ESTIMATORS):
-            if name in errors:
-                colour = ORANGE if name == "recurrent" else BLUE
-                draw_dot(axis, errors[name], -place, colour, name)
+        for place, name in enumerate(names[title]):
+            colour = ORANGE if name == "recurrent" else BLUE
+            draw_dot(axis, errors[name], -place, colour, name)
+        axis.set_yticks([-place for place in range(len(names[title]))], names[title])
+        axis.margins(y=0.1)
         axis.set_title(title, fontsize=9, loc="left")
-        axis.set_xlabel("error x 1000", fontsize=9)
         axis.set_xlim(0.0, 118.0)
         add_frame(axis, "x")
-    axes[0].set_yticks([-place for place in range(len(ESTIMATORS))], ESTIMATORS)
+    axes[-1].set_xlabel("error x 1000", fontsize=9)
     return figure
 
 
@@ -112,7 +115,7 @@ def on_measured_road() -> dict[str, Interval]:
 def draw_epsilon() -> Figure:
     """Draw errors against epsilon under both guaranteed release models, and without noise."""
     rows, looks = rows_of("guarantees"), {"capped": Look(ORANGE, "s"), "paced": Look(BLUE, "o")}
-    figure = make_figure(7.0, 3.3, dpi=160)
+    figure = make_figure(WIDTH, 2.8)
     for axis, metric in zip(figure.subplots(1, 2), METRICS, strict=True):
         for release, look in looks.items():
             cells = [paid(release=release, epsilon=each).labels for each in CURVE]
@@ -126,7 +129,7 @@ def draw_epsilon() -> Figure:
 
 def draw_queries() -> Figure:
     """Draw where schedules look, on the true density of the same traffic."""
-    figure = make_figure(7.0, 5.2, dpi=160)
+    figure = make_figure(WIDTH, 5.2)
     axes = figure.subplots(3, 2, sharex=True, sharey=True)
     for axis, name in zip(axes.flat, SCHEDULES, strict=True):
         watched = watch(name, Cell(ENV, name, KEYWORDS), TRAFFIC)
@@ -138,9 +141,9 @@ def draw_queries() -> Figure:
             extent=(SHOWN.start - 0.5, SHOWN.start + seconds - 0.5, -0.5, n - 0.5),
         )  # fmt: skip
         segment, second = np.nonzero(np.array(watched.history.queried)[SHOWN].T)
-        axis.plot(second + SHOWN.start, segment, "s", color=ORANGE, ms=2.4, mew=0.0)
+        axis.plot(second + SHOWN.start, segment, "s", color=ORANGE, ms=1.8, mew=0.0)
         error = -1000.0 * watched.row["reward"]
-        axis.set_title(f"{name} (error x 1000: {error:.1f})", fontsize=9, loc="left")
+        axis.set_title(f"{name}: {error:.1f}", fontsize=9, loc="left")
         axis.tick_params(labelsize=8)
     for axis in axes[:, 0]:
         axis.set_ylabel("segment", fontsize=9)
@@ -167,7 +170,7 @@ def draw_rewards() -> Figure:
     """Draw an episode's errors of density and speed in units of their scales, and the reward."""
     *_, (env, *_) = episode = list(played(700))
     road, infos = env.config.corridor, [info for *_, info in episode]
-    figure = make_figure(7.0, 2.8, dpi=160)
+    figure = make_figure(WIDTH, 2.8)
     axis = figure.subplots()
     lines = {
         "a: density error over its scale": (
@@ -190,7 +193,7 @@ def draw_observation() -> Figure:
     """Draw the blocks of an observation, each in colours from its least to its largest value."""
     *_, (env, observation, _, _) = played(SECOND)
     slices = env.interface.observations.slices
-    figure = make_figure(7.0, 4.6, dpi=160)
+    figure = make_figure(WIDTH, 4.2)
     axis = figure.subplots()
     table = np.full((len(slices), max(part.stop - part.start for part in slices.values())), np.nan)
     for row, part in zip(table, slices.values(), strict=True):
@@ -199,15 +202,14 @@ def draw_observation() -> Figure:
     image = axis.pcolormesh(table, cmap="cividis", vmin=0.0, vmax=1.0, edgecolors="white", lw=0.8)
     axis.invert_yaxis()
     names = [f"{name}  [{part.start}:{part.stop}]" for name, part in slices.items()]
-    axis.set_yticks(np.arange(len(slices)) + 0.5, names, fontsize=8)
-    axis.set_xticks(np.arange(table.shape[1]) + 0.5, map(str, range(table.shape[1])), fontsize=8)
-    axis.set_xlabel(
-        "place in the block: mainline segments 0 to 14, then ramps; or fixed sensors", fontsize=9
-    )
+    axis.set_yticks(np.arange(len(slices)) + 0.5, names, fontsize=7.5)
+    places = range(0, table.shape[1], 3)
+    axis.set_xticks([place + 0.5 for place in places], map(str, places), fontsize=8)
+    axis.set_xlabel("place in the block", fontsize=9)
     axis.spines[:].set_visible(False)
     axis.tick_params(length=0)
     bar = figure.colorbar(image, ax=axis, fraction=0.03, pad=0.01, ticks=[0, 1])
-    bar.ax.set_yticklabels(["least of\nits block", "largest of\nits block"], fontsize=8)
+    bar.ax.set_yticklabels(["least", "largest"], fontsize=8)
     return figure
 
 

@@ -41,7 +41,7 @@ def write_files(guide: str, folder: Path) -> None:
 def draw_network(net: Path, segments: Segmentation) -> Figure:
     """Draw the lanes of a network in grey, and over them its segments with their numbers."""
     network = sumolib.net.readNet(str(net), withInternal=True)
-    figure = make_figure(WIDTH, 2.6, dpi=160)
+    figure = make_figure(WIDTH, 2.2)
     axis = figure.subplots()
     for edge in network.getEdges(withInternal=True):
         for lane in edge.getLanes():
@@ -64,7 +64,7 @@ def draw_network(net: Path, segments: Segmentation) -> Figure:
             (BOUNDARY, "boundary segments"),
         )
     ]  # fmt: skip
-    axis.legend(handles=handles, loc="upper left", frameon=False, fontsize=9)
+    axis.legend(handles=handles, loc="upper left", frameon=False, fontsize=8)
     axis.annotate(
         "", (0.95, 0.22), (0.8, 0.16), xycoords="axes fraction", textcoords="axes fraction",
         arrowprops={"arrowstyle": "->", "color": "black"},
@@ -102,7 +102,7 @@ def draw_road(corridor: Corridor) -> Figure:
     """Draw segments to scale along the road, lanes across it, ramps beside it, and sensors."""
     n, lengths = corridor.geometry.n_mainline, np.array(corridor.geometry.segment_lengths)
     starts = np.concatenate([[0.0], np.cumsum(lengths[:n])])
-    figure = make_figure(9.0, 2.4, dpi=120)
+    figure = make_figure(WIDTH, 2.4)
     axis = figure.subplots()
     most = corridor.geometry.most_lanes
 

@@ -74,7 +74,7 @@ def play(config: EnvConfig, worlds: Worlds) -> Transcript:
 
 def draw(config: EnvConfig, worlds: Worlds, found: Transcript) -> Figure:
     """Draw both worlds above, and what is published and paid below."""
-    figure = make_figure(WIDTH, 6.2, dpi=160)
+    figure = make_figure(WIDTH, 5.4)
     (first, second), (published, ledger) = figure.subplots(2, 2, sharex=True)
     seconds = np.arange(1, found.square.size + 1)
     for world, axis in enumerate((first, second)):
@@ -88,22 +88,22 @@ def draw(config: EnvConfig, worlds: Worlds, found: Transcript) -> Figure:
         published.step(seconds, counts, **line | {"lw": 1.2})
         ledger.plot(seconds, 100.0 * found.paid[world], **line)
         axis.set_ylabel("segment", fontsize=9)
-    add_title(first, "World 0: the trip as it was", COLOURS[0])
-    add_title(second, "World 1: another trip in its place", COLOURS[1])
-    say(first, (320, 3.2), "dots: counted\nno dot: not queried,\nor budget spent", "black")
+    add_title(first, "World 0: the trip", COLOURS[0])
+    add_title(second, "World 1: another trip", COLOURS[1])
+    say(first, (320, 3.2), "dots: counted", "black")
     published.plot(seconds, found.released, ".", color="black", ms=4)
     published.set_ylim(0, 45)
     published.set_ylabel("count [veh]", fontsize=9)
-    add_title(published, f"Published: noisy counts (segment {SEGMENT})")
-    say(published, (192, 1.5), "dots: published\nlines: true, in either world", "black")
+    add_title(published, f"Noisy counts, segment {SEGMENT}")
+    say(published, (192, 1.5), "lines: true counts", "black")
     ledger.plot(seconds, 100.0 * found.square, ":", color="black", lw=1.8)
     ledger.axhline(100.0, color="black", lw=0.8)
     ledger.set_ylim(0, 112)
     ledger.set_ylabel("paid [%]", fontsize=9)
-    add_title(ledger, "Ledger: part of the budget that is paid")
+    add_title(ledger, "Budget that is paid")
     say(ledger, (190, 90), "trip of world 0", COLOURS[0])
     say(ledger, (357, 45), "trip of\nworld 1", COLOURS[1])
-    say(ledger, (330, 10), "dotted: squared\ndistance of the sums,\nof mu squared", "black")
+    say(ledger, (300, 8), "dotted: distance²\nof the sums / μ²", "black")
     for axis in figure.axes:
         add_frame(axis)
     for axis in (published, ledger):
@@ -122,13 +122,13 @@ def draw_others(axis: Axes, rest: Record, n_mainline: int) -> None:
 
 def add_title(axis: Axes, text: str, colour: str = "black") -> None:
     """Name a panel."""
-    axis.set_title(text, fontsize=9.5, loc="left", color=colour)
+    axis.set_title(text, fontsize=9, loc="left", color=colour)
 
 
 def say(axis: Axes, at: tuple[float, float], text: str, colour: str) -> None:
     """Write into a panel."""
     box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5}
-    axis.text(*at, text, fontsize=8.5, color=colour, bbox=box)
+    axis.text(*at, text, fontsize=7.5, color=colour, bbox=box)
 
 
 def main() -> None:

@@ -82,7 +82,7 @@ def test_maps_stand_in_columns_with_one_bar(episode, tmp_path):
         RoadMap("truth", history.truth, history), estimate_map(history, 1.0, "estimate"),
         RoadMap("queried", history.queried[::5], history, step=5),
     ]  # fmt: skip
-    figure = draw_maps([column, column], width=8.0)
+    figure = draw_maps([column, column])
     assert len(figure.axes) == 2 * 3 + 1
     titles = [axis.get_title(loc="left") for axis in figure.axes[:-1]]
     assert titles[::2] == titles[1::2] == [panel.title for panel in column]
