@@ -149,8 +149,6 @@ def _suitable(cells: Sequence[Cell]) -> tuple[list[Cell], list[str]]:
 
 def main(args: Args) -> None:
     """Play what is missing, and report."""
-    study = find_study(args)
-    folder = args.output or RESULTS / study.name
     _, _, keywords = args.name.partition(" ")
     for name, given in (("test_seeds", args.test_seeds), ("env", args.env), ("name", keywords)):
         allowed = "given with an output of its own, since the rows are others"
@@ -158,6 +156,8 @@ def main(args: Args) -> None:
     for name in ("test_seeds", "env", "workers", "records", "address") if args.report else ():
         given = getattr(args, name)
         require(not given, name, "left out where nothing is played", given)
+    study = find_study(args)
+    folder = args.output or RESULTS / study.name
     require_output(folder, () if args.report else None, own=OWN)
     if args.report:
         write_report(study, folder)

@@ -47,6 +47,19 @@ USES = {
         "--beside card.json": "--beside must be left out",
         "--address auto": "address must be … 'auto'",
     },
+    "evaluate --suite --output out": {
+        "": "policies must be given with --suite",
+        "--policies nobody.safetensors": "nobody.safetensors",
+        "--policies nobody.toml": "nobody.toml",
+        "--policies nobody": "'nobody'",
+        "--policies static static": "policies must be different",
+        "--policies static --beside nobody.json": "nobody.json",
+        "--policies static --replay 2": "replay must be given with cards beside",
+        "--policies static --fresh 1": "fresh must be",
+        "--test-seeds 2000": "--test-seeds must be left out with --suite",
+        "--estimators ekf": "--estimators must be left out with --suite",
+    },
+    "evaluate --suite none --output out": {"--policies static": "suite must be one of"},
     "record --records cache": {
         "--sed 0:1": "--sed, 0:1",
         "--workers x": "--workers",
@@ -98,6 +111,14 @@ USES = {
         "my-road.toml --also demand": "--also must be left out without --tune",
         "my-road.toml --seed 1": "--seed must be left out without --tune",
         "my-road.toml --force": "--force must be left out without --tune",
+        "road.json": "road must be a road file",
+        "nowhere.toml": "nowhere.toml",
+        "my-road.toml --test-seeds 1000:1004": "test_seeds must be … 2000..2999 … 1000",
+        """my-road.toml --env 'dptse_env:dptse/PrivateHighway-v1 {"parameters": "published"}'""":
+            "env.parameters must be left out",
+        "my-road.toml --estimators kalman": "estimator must be one of … kalman",
+        "my-road.toml --policies all": "schedule 'all' needs bandwidth 4",
+        "my-road.toml --policies nobody.safetensors": "nobody.safetensors",
     },
     "study --output out": {
         "moon": "study must be … 'moon'",
@@ -112,9 +133,8 @@ USES = {
         "tests.scripts.test_study:numbered": "numbered takes number: missing",
         """'tests.scripts.test_study:numbered {"number": 0}'""": "must be a Study, got int",
         "examples.my_study:STUDY --test-seeds all": "test_seeds must be … 'all'",
-        "examples.my_study:STUDY --env dptse_env:dptse/ShortHighway-v0 --report --quiet": (
-            "env must be left out"
-        ),
+        "examples.my_study:STUDY --env dptse_env:dptse/ShortHighway-v0 --report":
+            "env must be left out",
         "examples.my_study:STUDY --workers 0": "workers must be … 0",
         "examples.my_study:STUDY --report": "rows.parquet",
         """examples.my_study:STUDY --env 'SHORT {"bandwidth": 1}'""": "env must be of",
