@@ -70,15 +70,6 @@ def parse(words):
         tyro.cli(arguments, args=words[1:])
 
 
-def test_the_example_that_the_help_of_a_command_begins_with_can_be_parsed():
-    for module in MODULES.values():
-        lines = [*commands(importlib.import_module(module).__doc__.split("\n\n")[1].strip())]
-        assert lines
-        for line in lines:
-            assert line.startswith("dptse ")
-            check(line)
-
-
 def test_inline_commands_name_programs_that_exist():
     for page in PAGES:
         for name in re.findall(r"`dptse ([a-z][a-z-]*)", page.read_text(encoding="utf-8")):

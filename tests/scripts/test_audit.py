@@ -42,15 +42,6 @@ def test_a_guarantee_is_not_rejected_and_too_little_noise_is(tmp_path, capsys):
     assert weak["noise"]["p_value"] < 1e-10
 
 
-@pytest.mark.slow
-def test_what_the_paper_promises_is_rejected_with_vehicles_of_the_record(tmp_path):
-    found = run(tmp_path, {"preset": "printed", "epsilon": 1.0}, target="replaced", trials=100)
-    assert found["verdict"] == "rejected"
-    # The claim to users, not the account.
-    assert found["result"]["claim"]["mu"] == pytest.approx(mu_of(1.0, 0.05))
-    assert "boundary_inputs" in found["privacy"]["void_reasons"]
-
-
 def test_what_the_noise_alone_betrays_is_rejected(tmp_path, capsys):
     privacy = {"preset": "tests.agents.audit.mechanisms:SharedNoise", "epsilon": 5.0}
     found = run(tmp_path, privacy, trials=20)
@@ -75,29 +66,12 @@ def test_a_model_that_states_nothing_is_held_to_what_was_asked_of_it(tmp_path):
     assert found["privacy"]["mu"] is None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("factor", [1.0, 0.4])
-def test_the_paced_ledger_is_attacked_with_the_estimator_of_the_environment(factor, tmp_path):
-    paced = {"preset": "paced", "epsilon": 5.0}
-    found = run(tmp_path, paced, noise_factor=factor)
-    mu = mu_of(5.0, 0.05)
-    assert found["verdict"] == ("not rejected" if factor == 1.0 else "rejected")
-    assert 0.95 * mu < factor * found["distance"] <= mu
-    assert found["privacy"]["void_reasons"] == []
-
-
 @pytest.mark.parametrize(
-    ("privacy", "factor", "verdict"),
-    [
-        pytest.param(
-            {"preset": "printed", "epsilon": 1.0}, 1.0, "rejected", marks=pytest.mark.slow
-        ),
-        (CAPPED, 1.0, "not rejected"),
-        pytest.param(CAPPED, 0.4, "rejected", marks=pytest.mark.slow),
-    ],
+    ("factor", "verdict"),
+    [(1.0, "not rejected"), pytest.param(0.4, "rejected", marks=pytest.mark.slow)],
 )
-def test_one_run_says_the_same(privacy, factor, verdict, tmp_path, capsys):
-    found = run(tmp_path, privacy, one_run=True, trials=5000, noise_factor=factor)
+def test_one_run_says_the_same(factor, verdict, tmp_path, capsys):
+    found = run(tmp_path, one_run=True, trials=5000, noise_factor=factor)
     assert found["verdict"] == verdict
     assert found["result"]["epsilon"] is None
     assert (found["result"]["mu"]["value"] > found["result"]["claim"]["mu"]) == (

@@ -8,7 +8,6 @@ import logging
 import re
 import shlex
 import shutil
-import socket
 import subprocess
 import sys
 import tomllib
@@ -26,7 +25,7 @@ from dptse_env.utils.registry import EXTRAS
 from dptse_env.versions import code_version
 from scripts import dptse, info
 from scripts.dptse import MODULES
-from tests.helpers import ROOT, SHORT, fast_and_slow, save_untrained
+from tests.helpers import ROOT, SHORT, save_untrained
 from tests.importers.data import plain, stream
 from tests.importers.sumo_net.conftest import motorway
 from tests.scripts.commands import refused, run_command
@@ -219,81 +218,36 @@ def test_a_mistake_of_the_program_keeps_its_traceback(monkeypatch):
         run_command("info")
 
 
-def test_a_program_of_its_own_ends_with_the_status():
-    words = [sys.executable, "-m", "scripts.dptse", "record", "--train-seeds", "3:1"]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: train_seeds")
-
-
-def content(pattern):
-    """Return the content of the first file of the checkout that a pattern fits."""
-    return min(ROOT.glob(pattern)).read_bytes()
-
-
-def with_keyword(keyword):
-    return ["--env", f'{SHORT} {{{{"{keyword}": "{{path}}"}}}}']
-
-
-SETTINGS = b'{"x": {"estimator": "ekf", "settings": {"initial_variance": 1}, "provenance": {}}}'
-FIELD = ["--cell", "0.1", "--interval", "5", "--segments", "6"]
-FIELD_ROAD = ["--lanes", "2", "--speed-limit", "100"]
-NETWORK = b"<configuration><input><net-file value='n.net.xml'/></input></configuration>"
-POINTS = ["import", "trajectories", "--env", SHORT]
+NOISE, FOLDER = bytes(range(256)), "a folder"
+NETWORK = b"<configuration><input><net-file value='n.net.xml'/></inp"
+TRAJECTORIES = b"<fcd-export><timestep time='0'><vehicle id='a' x='0' y='0' sp"
+POINTS = "import trajectories --env SHORT --output out"
+FIELD = "import field --cell 0.1 --interval 5 --segments 6 --lanes 2 --speed-limit 100 --output out"
 FILES = {
-    "road": ("r.toml", b"n_mainline = 'six'\n", ["record", *with_keyword("corridor")]),
-    "parameters": (
-        "p.json", content("dptse_env/model/sets/*.json"), ["record", *with_keyword("parameters")],
-    ),
-    "settings": ("s.json", SETTINGS, ["evaluate", *with_keyword("estimator_settings")]),
-    "policy": (
-        "p.safetensors", content("dptse_env/policies/*.safetensors"),
-        ["evaluate", "--policies", "{path}"],
-    ),
-    "model": ("m.zip", SETTINGS, ["evaluate", "--policies", "stable_baselines3:PPO={path}"]),
-    "weights": (
-        "n.safetensors", content("dptse_env/estimators/weights/*.safetensors"),
-        ["train-estimator", "--initial", "{path}"],
-    ),
-    "trajectories": (
-        "t.xml", b"<fcd-export><timestep time='0'><vehicle id='a' x='0' y='0' speed='3' lane='e_0'",
-        [*POINTS, "--format", "fcd", "--files", "{path}"],
-    ),
-    "mapping": ("m.toml", b'format = "fcd"\n', [*POINTS, "--files", "x", "--mapping", "{path}"]),
-    "field": (
-        "d.txt", b"1 2 3\n4 5 6\n",
-        ["import", "field", *FIELD, *FIELD_ROAD, "--density", "{path}", "--speed", "{path}"],
-    ),
-    "configuration": (
-        "a.sumocfg", NETWORK, ["import", "network", "--path", "a b", "--configuration", "{path}"],
-    ),
-    "net": (
-        "a.net.xml", b"<net version='1.9'></net>",
-        ["import", "network", "--path", "a b", "--net", "{path}"],
-    ),
-}  # fmt: skip
-"""Files that commands read: a name, a content, and the command."""
-
-FAST = [
-    ("road", "missing"), ("policy", "truncated"), ("weights", "noise"), ("net", "folder"),
-    ("trajectories", "truncated"), ("field", "folder"),
-]  # fmt: skip
-ALL = [(kind, how) for kind in FILES for how in ("missing", "folder", "noise", "truncated")]
-OUTPUTS = {"record": ["--records", "cache"]}
+    """record --records cache --env 'SHORT {"corridor": "r.toml"}'""": ("r.toml", None),
+    """record --records cache --env 'SHORT {"parameters": "p.json"}'""": ("p.json", b'{"x": {'),
+    """evaluate --env 'SHORT {"estimator_settings": "s.json"}' --output out""": ("s.json", NOISE),
+    "evaluate --policies p.safetensors --output out": ("p.safetensors", NOISE),
+    "evaluate --policies stable_baselines3:PPO=m.zip --output out": ("m.zip", FOLDER),
+    "train-estimator --initial n.safetensors --output out": ("n.safetensors", NOISE),
+    f"{POINTS} --format fcd --files t.xml": ("t.xml", TRAJECTORIES),
+    f"{POINTS} --files x --mapping m.toml": ("m.toml", None),
+    f"{FIELD} --density d.txt --speed d.txt": ("d.txt", FOLDER),
+    "import network --path 'a b' --configuration a.sumocfg --output out": ("a.sumocfg", NETWORK),
+    "import network --path 'a b' --net a.net.xml --output out": ("a.net.xml", FOLDER),
+}
+"""Commands with files that they read: a name, and a content, None where it is missing."""
 
 
-@pytest.mark.parametrize(("kind", "how"), fast_and_slow(ALL, FAST))
-def test_a_file_that_cannot_be_read_is_named(kind, how, tmp_path, monkeypatch):
+@pytest.mark.parametrize("words", FILES)
+def test_a_file_that_cannot_be_read_is_named(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    name, whole, words = FILES[kind]
-    path = tmp_path / name
-    if how == "folder":
-        path.mkdir()
-    elif how != "missing":
-        path.write_bytes(bytes(range(256)) if how == "noise" else whole[: len(whole) * 2 // 3])
-    key = words[1] if words[0] == "import" else words[0]
-    given = [word.format(path=path) for word in words]
-    line = refused(*given, *OUTPUTS.get(key, ["--output", "out"]))
+    name, content = FILES[words]
+    if content == FOLDER:
+        Path(name).mkdir()
+    elif content is not None:
+        Path(name).write_bytes(content)
+    line = refused(*shlex.split(words.replace("SHORT", SHORT)))
     assert name in line
     assert "[Errno" not in line
     assert {entry.name for entry in tmp_path.iterdir()} <= {name}
@@ -306,19 +260,3 @@ def test_an_unfit_policy_is_found_before_anything_is_recorded(tmp_path):
     line = refused("evaluate", "--env", SHORT, "--policies", policy, *folders)
     assert "bandwidth is 3 for the policy and 2 for the environment" in line
     assert list(tmp_path.iterdir()) == [policy]
-
-
-@pytest.mark.slow
-def test_a_cluster_that_does_not_answer_is_one_line(tmp_path, monkeypatch):
-    words = ["evaluate", "--env", SHORT, "--output", tmp_path / "out"]
-    assert "executor ray" in refused(*words, "--address", "auto")
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "ray", None)
-        assert "dptse-env[ray]" in refused(*words, "--executor", "ray", status=1)
-    pytest.importorskip("ray")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    line = refused(*words, "--executor", "ray", "--address", address, status=1)
-    assert address in line
-    assert not Path(tmp_path / "out").exists()

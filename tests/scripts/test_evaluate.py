@@ -218,26 +218,20 @@ def test_estimators_are_judged_on_a_measured_field(tmp_path):
     tests = [each._replace(share=float(each.name == "test")) for each in SPLITS]
     import_field(write(tmp_path), ROAD, tmp_path / "road", tests, 100)
 
-    def words(**privacy):
-        own = {"corridor": str(tmp_path / "road" / "road.toml"), "bandwidth": 2, **privacy}
+    def words(**keywords):
+        own = {"corridor": str(tmp_path / "road" / "road.toml"), "bandwidth": 2, **keywords}
         env = f"dptse_env:dptse/PaperHighway-v0 {json.dumps(own)}"
-        return [
-            "evaluate", "--env", env, "--test-seeds", "2000:2004", "--policies", "round-robin",
-            "--estimators", "random_walk", "ekf", "--workers", "1", "--json",
-        ]  # fmt: skip
+        more = "--policies", "round-robin", "--estimators", "random_walk", "--workers", "1"
+        return "evaluate", "--env", env, "--test-seeds", "2000:2004", *more, "--output"
 
-    def means(epsilon):
-        given = words(privacy="corrected", epsilon=epsilon, parameters="w99-3lane")
-        found = json.loads(run_command(*given, "--output", tmp_path / f"{epsilon}").stdout)
-        assert found["title"].startswith("PaperHighway-v0, road road, ")
-        assert "4 episodes on test traffic" in found["title"]
-        return {row["estimator"]: row["means"] for row in found["rows"]}
-
-    noisy, exact = means(1.0), means(1e4)
-    for name in ("random_walk", "ekf"):
-        assert exact[name]["error"]["mean"] < 0.5 * noisy[name]["error"]["mean"]
-        assert 0.1 < noisy[name]["chi2_density"]["mean"] < 10.0
-    refusal = refused(*words(privacy="paced"), "--output", tmp_path / "no")
+    errors = []
+    for epsilon in (1.0, 1e4):
+        given = words(privacy="corrected", epsilon=epsilon)
+        found = json.loads(run_command(*given, tmp_path / f"{epsilon}", "--json").stdout)
+        assert "road road, " in found["title"]
+        errors.append(found["rows"][0]["means"]["error"]["mean"])
+    assert errors[1] < 0.5 * errors[0]
+    refusal = refused(*words(privacy="paced"), tmp_path / "no")
     assert "on a road of measured fields, got 'paced'" in refusal
 
 

@@ -122,14 +122,6 @@ def commands_of(name):
     return [shlex.split(line)[1:] for line in re.findall(r"^dptse .*$", page, re.MULTILINE)]
 
 
-SMALL = {
-    "fit": ["--trials", "1", "--estimators", "ekf", "--policies", "round-robin", "--workers", "1"],
-    "evaluate": ["--workers", "1"],
-    "train": ["--steps", "2000"],
-}
-"""What makes commands of the page short."""
-
-
 def test_the_page_on_own_data_has_commands_that_run(fifteen_minutes, monkeypatch):
     monkeypatch.chdir(fifteen_minutes)
     commands = commands_of("your-data.md")
@@ -157,21 +149,6 @@ def test_the_page_on_own_data_imports_a_field(tmp_path, monkeypatch):
     assert "training: 1 window(s), traffic seeds 0\n" in printed
     road = read_corridor("ring-road/road.toml")
     assert (road.name, road.geometry.n_mainline) == ("ring-road", 6)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*values measured or tuned on")
-def test_the_page_on_own_data_goes_on_to_a_policy(fifteen_minutes, monkeypatch):
-    monkeypatch.chdir(fifteen_minutes)
-    first, *rest = commands_of("your-data.md")[:-1]
-    printed = run(*first[1:], "--output", "again")
-    following = re.search(r"^next: dptse (evaluate .*)$", printed, re.MULTILINE)[1]
-    if not Path("us-101").exists():
-        run(*first[1:])
-    for words in (*rest, [*shlex.split(following), "--output", "following"]):
-        done = run_command(*words, *SMALL.get(words[0], []))
-        assert done.returncode == 0, done.stderr
-    assert "1 episode on test traffic" in done.stdout
 
 
 @pytest.mark.parametrize(

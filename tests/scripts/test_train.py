@@ -1,21 +1,16 @@
 """The command: it trains, goes on, trains several seeds, and refuses."""
 
-import io
 import json
 import re
 import shlex
-import sys
 
 import pytest
 
 pytest.importorskip("sb3_contrib")
 pytest.importorskip("tyro")
 
-import tyro
 
-from agents.training.run import least
 from agents.training.run_files import read_progress
-from scripts import train
 from tests.agents.training.plans import SMALL, STEPS, without_time
 from tests.helpers import SHORT
 from tests.scripts.commands import refused, run_command
@@ -62,20 +57,6 @@ def test_it_trains_and_goes_on(tmp_path):
     assert shlex.split(found["next"]) == command
     assert (tmp_path / "one" / "policy.safetensors").read_bytes() == before
     assert "seed is 0 there and 1 now" in refused("train", *given, "--seed", "1")
-
-
-def test_the_bar_has_the_error_beside_the_best_rules(tmp_path, monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    train.main(tyro.cli(train.Args, args=words(tmp_path, "ppo")))
-    rules = json.loads((tmp_path / "rules.json").read_text())
-    rule, bar = min(rules, key=rules.get), sys.stderr.getvalue()
-    errors = [1000 * least(row) for row in read_progress(tmp_path)]
-    assert f"{rule}={1000 * rules[rule]:.1f}" in bar
-    assert all(f"validation={error:.1f}" in bar for error in errors)
 
 
 def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):

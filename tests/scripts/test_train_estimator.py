@@ -11,11 +11,10 @@ pytest.importorskip("tyro")
 import gymnasium as gym
 import tyro
 
-from agents.filters.plan import OWN, Round
 from agents.training.run_files import read_progress
 from dptse_env.estimators.recurrent import read_weights
 from scripts import train_estimator
-from scripts.train_estimator import Args, make_plan, parse_round
+from scripts.train_estimator import Args, make_plan
 from tests.helpers import SHORT
 
 PLAN = {
@@ -59,13 +58,6 @@ def test_it_trains_a_pair_that_an_environment_takes(tmp_path, capsys):
         gym.make(SHORT, privacy=privacy, **keywords).reset(seed=0)
     with pytest.raises(ValueError, match="width is 4 there and 8 now"):
         train_estimator.main(arguments(tmp_path, "--plan", json.dumps({**PLAN, "width": 8})))
-
-
-def test_rounds_are_read_from_text():
-    assert parse_round("own:3:40") == Round(OWN, 3, 40)
-    for text in ("own", "own:a:4", "own:3:4:5", "own:-1:4"):
-        with pytest.raises(ValueError, match=rf"rounds must be like 'ekf:72:200', got '{text}'"):
-            parse_round(text)
 
 
 def test_an_episode_is_no_longer_than_the_records_of_the_roads(tmp_path):
