@@ -12,8 +12,6 @@ pytest.importorskip("torch")
 pytest.importorskip("sb3_contrib")
 
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
@@ -30,7 +28,7 @@ from dptse_env.sb3 import (
 )
 from dptse_env.sb3.saved import KINDS
 from tests.helpers import ABOUT, SHORT, SumRelease, save_untrained, untrained
-from tests.hostile import check_hostile, check_refusals, edited
+from tests.hostile import check_refusals, edited
 
 SPANS = {"privacy": SumRelease, "query_spans": (1, 2), "bandwidth": 3}
 
@@ -193,32 +191,14 @@ def test_the_card_describes_the_policy(stored):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        (
-            {"action": "mask"},
-            "action is 'slots' for the policy and 'mask' for the environment; make the environment "
-            "with action='slots'$",
-        ),
-        ({"bandwidth": 3}, r"bandwidth is 2 for the policy and 3 for the environment"),
-        ({"query_every": 4}, r"query_every is 1 for the policy and 4 for the environment"),
-        (
-            {"incident": "none"},
-            r"corridor is 'short-highway \(6 .*\), traffic (\w{8})' for the policy and "
-            r"'short-highway \(6 .*\), traffic (?!\1)\w{8}' for the environment",
-        ),
-        (
-            {"privacy": "capped"},
-            r"channels is \['mainline released_speed'\] for .*\['mainline released_flow'\]",
-        ),
-        ({"corridor": {"fixed_sensors": [4, 7]}}, r"sensors on \[5, 7\]\), .* on \[4, 7\]\)"),
-        ({"corridor": {"fixed_sensors": [7]}}, r"sensors on \[5, 7\]\), .* sensors on \[7\]\)"),
-        (
-            {"loops": {"positions": [0.2], "ramps": [4]}},
-            r"sensors on \[5, 7\]\), .* sensors on \[5, 7\], loops at 0.2 km, ramp 4 every 20 s\)",
-        ),
-        (
-            {"loops": {"positions": [0.2], "least_count": 5}},
-            r"loops at 0.2 km every 20 s \(least count 5\)\), traffic",
-        ),
+        ({"action": "mask"}, "action is 'slots' .* 'mask' .* with action='slots'$"),
+        ({"bandwidth": 3}, "bandwidth is 2 .* 3 "),
+        ({"query_every": 4}, "query_every is 1 .* 4 "),
+        ({"incident": "none"}, r"corridor is .* traffic (\w{8})' .* traffic (?!\1)\w{8}' "),
+        ({"privacy": "capped"}, r"channels is .*released_speed'\] .*released_flow'\]"),
+        ({"corridor": {"fixed_sensors": [4, 7]}}, r"on \[5, 7\]\), .* on \[4, 7\]\)"),
+        ({"loops": {"positions": [0.2], "ramps": [4]}}, "loops at 0.2 km, ramp 4 every 20 s"),
+        ({"loops": {"positions": [0.2], "least_count": 5}}, r"every 20 s \(least count 5\)"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:privacy.preset")
@@ -243,12 +223,9 @@ def test_a_shared_network_moves_on_purpose_to_another_road_and_bandwidth(path):
     save_policy(path, policy, config, **ABOUT)
     env = make_env(bandwidth=3, incident="none", estimator="random_walk", epsilon=0.3)
     for allow, message in (
-        (
-            (),
-            r"'paper-highway \(15 mainline .* and .short-highway .*allow bandwidth and",
-        ),
-        (("bandwidth",), r"corridor is .*to transfer it on purpose, allow corridor$"),
-        (("action",), "allow must be of corridor, bandwidth, privacy, got 'action'"),
+        ((), r"'paper-highway .* and .short-highway .*allow bandwidth and"),
+        (("bandwidth",), "corridor is .* on purpose, allow corridor$"),
+        (("action",), "allow must be of .* got 'action'"),
     ):
         with pytest.raises(ValueError, match=message):
             load_policy(path, env, allow=allow)
@@ -264,21 +241,16 @@ def test_a_shared_network_moves_on_purpose_to_another_road_and_bandwidth(path):
     )
 
 
+CAPPED = {"preset": "capped", "cap": 16}
+
+
 @pytest.mark.parametrize(
     ("trained", "here", "told"),
     [
-        ({"epsilon": 5.0}, {"epsilon": 1.0}, r"epsilon is 5\.0 for .* and 1\.0 for the env\w+"),
-        ({"delta": 0.01}, {}, r"delta is 0\.01 for .* and 0\.05 for the environment"),
-        (
-            {"privacy": {"preset": "capped", "cap": 16}},
-            {"privacy": "capped", "epsilon": 2.0},
-            r"epsilon is 1\.0 .*; privacy\.cap is 16 for the policy and 64 for the environment",
-        ),
-        (
-            {"privacy": {"preset": "printed", "boundary_inputs": "nominal"}},
-            {"privacy": "corrected"},
-            r"preset is 'printed' for .* and 'corrected' .*boundary_inputs is 'nominal' for .*",
-        ),
+        ({"epsilon": 5.0}, {"epsilon": 1.0}, r"epsilon is 5\.0 .* 1\.0 "),
+        ({"delta": 0.01}, {}, r"delta is 0\.01 .* 0\.05 "),
+        ({"privacy": CAPPED}, {"privacy": "capped"}, r"privacy\.cap is 16 .* 64 "),
+        ({}, {"privacy": "corrected"}, "preset is 'printed' .* 'corrected' "),
         ({}, {"privacy": {"noise": "secure"}}, None),
         ({"privacy": {"boundary_inputs": "true"}}, {}, None),
     ],
@@ -293,16 +265,6 @@ def test_another_release_is_told_unless_it_is_allowed(path, trained, here, told)
     assert found is None or len(found) == 1
     with warnings.catch_warnings(action="error"):
         load_policy(path, env, allow=("privacy",))
-
-
-def test_a_shipped_policy_tells_of_the_epsilon_of_the_id():
-    env = make_env(bandwidth=1, privacy="corrected")
-    message = (
-        r"^policy 'short-highway-corrected' was trained for another release: privacy\.epsilon is "
-        r"5\.0 for the policy and 1\.0 for the environment$"
-    )
-    with pytest.warns(UserWarning, match=message):
-        load_policy("short-highway-corrected", env)
 
 
 def test_a_perceptron_stays_on_its_road(path):
@@ -344,13 +306,6 @@ def test_a_shipped_policy_acts_where_it_was_trained(name):
         assert not infos["n_dropped"].any()
 
 
-@pytest.mark.parametrize("action", ["slots", "mask"])
-def test_damaged_files_are_refused(tmp_path, action):
-    env = make_env(action=action)
-    good = save_untrained(tmp_path / "good.safetensors", action)
-    check_hostile(lambda path: load_policy(path, env), good, tmp_path / "bad.safetensors")
-
-
 def arguments(**values):
     return lambda card, weights: card["policy"]["arguments"].update(values)
 
@@ -358,18 +313,12 @@ def arguments(**values):
 WRONG = {
     "slots": [
         (lambda c, w: c["fits"].update(format="dptse-policy-1"), "format is 'dptse-policy-1'"),
-        (lambda c, w: c["fits"].update(action="x" * 10**5), r"action is 'x+\.\.\.x+' for .*;"),
-        (lambda c, w: c["fits"].update(dict.fromkeys(c["fits"], 400 * "x"), action="slots",
-                                  privacy={}),
-         r"format is 'x+\.\.\.x+' for .*; corridor is .* for the environment$"),
-        (lambda c, w: c["fits"]["channels"].append("colour"), r"channels is \['colour'\] for the"),
-        (lambda c, w: c["fits"].update(channels=[{}] * 9), r"channels is \['\{\}'\] for the"),
+        (lambda c, w: c["fits"].update(action="x" * 10**5), r"action is 'x+\.\.\.x+' "),
+        (lambda c, w: c["fits"]["channels"].append("colour"), r"channels is \['colour'\] "),
         (lambda c, w: c["policy"].update({"class": "Oracle"}), "must be one of .*'Oracle'"),
         (lambda c, w: c["policy"].update({"class": "ActorCriticPolicy"}), "be layers, units, got"),
         (arguments(width=10**9), r"describe must be at most \d+, got 40{18}$"),
         (arguments(width=10**300), r"at most \d+, got an integer of 600 digits$"),
-        (lambda c, w: (arguments(width=2000)(c, w), w.update(extra=np.zeros(2**22 - 2**14, "f4"))),
-         r"must be at most 4\d{6}, got 16000000$"),
         (arguments(width=7), r"scorer\.\S+ must be float32 of shape"),
         (arguments(skips_sensors=1), "skips_sensors must be a bool"),
         (arguments(depth=3), "arguments must be reach, skips_sensors, width, got"),
@@ -378,8 +327,7 @@ WRONG = {
     ],
     "mask": [
         (arguments(layers=[12_000] * 3), r"must be at most 1\d*, got 2\d{8}$"),
-        (arguments(layers=[10**4000]), "got an integer of 4001 digits$"),
-        (arguments(layers=[1] * 20_000), r"number must be an integer in 0\.\.64, got 20000"),
+        (arguments(layers=[1] * 20_000), r"number must be .* got 20000"),
         (arguments(layers=[0]), r"an integer >= 1, got 0"),
         (arguments(layers={"pi": [1]}), "layers must be a list of widths"),
         (arguments(units="Linear"), "units must be one of Tanh, ReLU"),
@@ -400,52 +348,6 @@ def test_cards_and_weights_that_do_not_agree_are_refused(tmp_path, action):
         check_refusals(lambda path: load_policy(path, env), path, [(k, edited(good, change))])
         with pytest.raises(ValueError, match=message):
             load_policy(path, env)
-
-
-json_values = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats(-9, 9)
-    | st.text(max_size=8)
-    | st.sampled_from([2**63, 10**300, 10**4000]),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner),
-    max_leaves=6,
-)
-
-
-@pytest.fixture(scope="module")
-def acting(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("saved")
-    return {
-        action: (save_untrained(folder / f"{action}.safetensors", action), make_env(action=action))
-        for action in ("slots", "scores", "sequential")
-    }
-
-
-@given(data=st.data())
-@settings(max_examples=60)
-def test_edited_cards_are_refused_or_act(acting, data):
-    good, env = acting[data.draw(st.sampled_from(sorted(acting)))]
-
-    def change(card, weights):
-        node = card
-        for key in data.draw(st.sampled_from([["policy", "arguments"], ["fits"], ["policy"], []])):
-            node = node[key]
-        node[data.draw(st.sampled_from(sorted(node)))] = data.draw(json_values)
-
-    path = good.with_name("edited.safetensors")
-    path.write_bytes(edited(good, change))
-    try:
-        policy = load_policy(path, env, allow=TRANSFERABLE)
-    except ValueError as problem:
-        refusal = str(problem)
-    else:
-        refusal = "edited.safetensors"
-        observation, _ = env.reset(seed=0)
-        env.step(policy.predict(observation)[0])
-    assert "edited.safetensors" in refusal
-    assert len(refusal.splitlines()) == 1
 
 
 def test_what_cannot_be_saved(stored):

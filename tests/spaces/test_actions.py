@@ -13,7 +13,6 @@ from dptse_env.spaces.actions import (
     ScoresAction,
     SequentialAction,
     SlotsAction,
-    first_that_fit,
 )
 
 FIRST = np.zeros(1, dtype=np.int64)
@@ -138,20 +137,6 @@ def test_masks_flag_all_choices_that_are_valid(kind, size):
     assert np.argwhere(~masks).tolist() == ([[1, 2]] if kind is SequentialAction else [])
 
 
-def test_equal_costs_of_two_are_paid_for_while_the_bandwidth_lasts():
-    order = np.array([[3, 1, 0, 2], [0, 1, 2, 3]])
-    kept = first_that_fit(order, np.full(4, 2), 5)
-    assert kept.tolist() == [[False, True, False, True], [True, True, False, False]]
-
-
-def test_slots_refill_repeats_in_rotation():
-    played = Played(SlotsAction, 3)
-    first, second = (played.decode([4, 4, 4]) for _ in range(2))
-    assert indices(first) == [0, 1, 4]
-    assert indices(second) == [2, 3, 4]
-    assert first.n_dropped.tolist() == [2]
-
-
 def test_slots_are_as_many_as_there_may_be_queries_and_are_filled_up_and_cut():
     for bandwidth, slots in ((4, 4), (7, 5), (99, 8)):
         assert Played(SlotsAction, bandwidth, COSTS).encoding.space.nvec.tolist() == [8] * slots
@@ -162,14 +147,6 @@ def test_slots_are_as_many_as_there_may_be_queries_and_are_filled_up_and_cut():
     decision = played.decode([4, 5, 6, 7])
     assert decision.queried[0] @ COSTS == 4
     assert decision.n_dropped.tolist() == [2]
-
-
-def test_sequential_completes_after_bandwidth_picks():
-    played = Played(SequentialAction, 3)
-    decisions = [played.decode(pick) for pick in (5, 2, 0)]
-    assert [bool(decision.complete[0]) for decision in decisions] == [False, False, True]
-    assert indices(decisions[-1]) == [0, 2, 5]
-    assert not played.pending.picked.any()
 
 
 def test_sequential_is_complete_when_nothing_fits_any_more():

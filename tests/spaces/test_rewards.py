@@ -18,7 +18,7 @@ def reward_of(term, error):
 
 
 def error_of(density_error, speed_error, occupied=(True, True)):
-    density = np.where(occupied, 30.0, 0.0)[None]
+    density = np.where(occupied, 0.5, 0.0)[None]
     speed = np.full((1, 2), 80.0)
     return estimation_error(
         density, speed, density + np.array([density_error]), speed + np.array([speed_error])
