@@ -112,6 +112,9 @@ def test_every_scenario_is_an_environment_and_every_road_another_one():
     assert len(digests) == len(ROADS)
 
 
+RAMPS = "on_ramps", "off_ramps"
+
+
 # Sections -----------------------------------------------------------------------------------------
 
 
@@ -128,6 +131,9 @@ def test_highways_differ_in_everything_that_roads_differ_in():
     assert 0.2 < max(lengths) <= LENGTHS[1]
     assert {each.conditions.drivers.model for each in highways} == {"W99", "IDM", "Krauss"}
     assert {0, 6} <= {each.geometry.n_ramps for each in highways}
+    on, off = ({len(getattr(each.geometry, name)) for each in highways} for name in RAMPS)
+    assert len(on) > 3
+    assert len(off) > 3
     least = [
         min(rate for _, rate in each.conditions.published_demand.mainline) for each in highways
     ]
@@ -380,8 +386,8 @@ def test_a_teacher_is_heard_where_it_knows_roads_and_noise_alone(night):
     assert Batch([parts[0].pick(np.arange(2))]).taught is None
     said = torch.cat([ordinary.truth, torch.ones_like(ordinary.truth)], -1)
     assert float(teacher_loss(ordinary.roads, said, said)) == 0.0
-    wide = said * torch.tensor([1.0, 1.0, np.e, 1.0])
-    assert float(teacher_loss(ordinary.roads, wide, said)) == pytest.approx(0.03)
+    wide = said * torch.tensor([1.0, 1.0, np.e**2, 1.0])
+    assert float(teacher_loss(ordinary.roads, wide, said)) == pytest.approx(0.12)
     scales = torch.cat([ordinary.roads.scales, torch.zeros_like(ordinary.roads.scales)], -1)
     assert float(teacher_loss(ordinary.roads, said + 0.1 * scales, said)) == pytest.approx(0.2)
 

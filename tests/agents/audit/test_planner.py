@@ -177,6 +177,11 @@ def test_a_replaced_vehicle_tells_more_than_a_deleted_one(record):
     assert replaced > 1.2 * deleted
 
 
+def test_a_target_that_does_not_fit_is_named(record):
+    with pytest.raises(ValueError, match=r"target must be one of \[.*\].* got 'replaced'"):
+        Planner(config(adjacency="add_remove")).choose(record, "replaced")
+
+
 @pytest.mark.parametrize(("kind", "need"), [("deleted", 1), ("replaced", 2)])
 def test_an_empty_road_has_no_target(kind, need, record):
     empty = record
