@@ -40,6 +40,7 @@ def _code(language: str, file: str | None, text: str) -> str:
         return f"%%writefile {file}\n{text}"
     if language == "python":
         return text
+    text = re.sub(r"\\\n *", "", text)
     # A notebook runs in the environment that it was started from.
     lines = [line for line in text.splitlines() if "venv" not in line]
     return "\n".join(f"!{line}" for line in lines)
