@@ -143,7 +143,7 @@ def draw_errors(
     panels = list(next(each[row] for each in series.values() for row in rows if row in each))
     n_columns = min(len(panels), 1 if max(map(len, rows)) > LONG_NAME else 2)
     n_lines = math.ceil(len(panels) / n_columns)
-    figure = make_figure(WIDTH, n_lines * (0.9 + (0.18 + 0.12 * most) * len(rows)) + 0.2)
+    figure = make_figure(WIDTH, n_lines * (1.0 + (0.18 + 0.12 * most) * len(rows)) + 0.2)
     axes = list(figure.subplots(n_lines, n_columns, sharey=True, squeeze=False).flat)
     for axis in axes[len(panels) :]:
         axis.remove()
@@ -153,12 +153,13 @@ def draw_errors(
         for place, row in enumerate(rows):
             own = {name: each[row][panel] for name, each in series.items() if row in each}
             for k, (name, interval) in enumerate(own.items()):
-                shift = ((len(own) - 1) / 2 - k) * 0.3
+                shift = ((len(own) - 1) / 2 - k) * min(0.3, 0.85 / len(own))
                 draw_dot(axis, interval, shift - place, colours[name], name)
         axis.set_xlabel(fill(panel, 48 // n_columns), fontsize=9)
         if log:
             set_log(axis, ERROR_TICKS)
         axis.margins(x=0.2)
+        axis.set_ylim(0.5 - len(rows), 0.5)
         add_frame(axis, "x")
     add_legend(figure, axes[:1])
     return figure
@@ -293,12 +294,14 @@ def draw_level(axis: Axes, interval: Interval, label: str) -> None:
     axis.axhspan(interval.low, interval.high, color=GREY, alpha=0.11, linewidth=0)
 
 
-def draw_rule(axis: Axes, rule: str, error: float) -> None:
-    """Draw the error of a rule as a line with its name at the right end."""
-    axis.axhline(error, color=GREY, linestyle=":", linewidth=1.0)
-    axis.annotate(
-        rule, (1.0, error), xycoords=("axes fraction", "data"), fontsize=7, ha="right", va="bottom"
-    )
+def draw_rules(axis: Axes, rules: Mapping[str, float]) -> None:
+    """Draw the errors of rules as lines with their names, side by side lest they overlap."""
+    for k, (rule, error) in enumerate(sorted(rules.items(), key=lambda each: each[1])):
+        axis.axhline(error, color=GREY, linestyle=":", linewidth=1.0)
+        axis.annotate(
+            rule, (1.0 - 0.2 * (k % 5), error), xycoords=("axes fraction", "data"),
+            fontsize=7, ha="right", va="bottom",
+        )  # fmt: skip
 
 
 def shifted(places: Sequence[float], share: float, log: bool) -> FloatArray:

@@ -88,8 +88,9 @@ class Args(
     """Traffic seeds, first:stop; the heading names their kind."""
     seed: int = 0
     """Seeds noise and estimators, one stream for each traffic seed."""
-    reference: str = "round-robin"
-    """Policy that the others are compared with."""
+    reference: str | None = None
+    """Policy that the others are compared with; round-robin, but none beside a single policy of
+    several estimators."""
     acts: Literal["deterministic", "drawn"] | None = None
     """Take likeliest actions, or draw them; else as policies say."""
     transfer: bool = False
@@ -139,12 +140,14 @@ class Score:
     Attributes:
         means: By error, and of the squared errors over their reported variances.
         differences: By error, to the reference with this estimator, paired by traffic and noise.
+        estimator_differences: By error, to this policy with the estimator of its least error.
     """
 
     estimator: str
     policy: str
     means: Mapping[str, Interval]
     differences: Mapping[str, Interval]
+    estimator_differences: Mapping[str, Interval]
 
     @property
     def error(self) -> float:
@@ -152,9 +155,18 @@ class Score:
         return self.means[ERROR].mean
 
 
+def find_reference(args: Args) -> str:
+    """Return the policy that the others are compared with."""
+    if args.reference is not None:
+        return args.reference
+    is_alone = len(args.policies) == 1 and len({*args.estimators}) > 1
+    return args.policies[0] if is_alone else ROUND_ROBIN
+
+
 def compare(args: Args) -> None:
     """Record what is missing, evaluate, and write tables, rows and figures."""
     title, cells = make_cells(args)
+    reference = policy_name(find_reference(args))
     seeds = parse_seeds(args.test_seeds, "test_seeds")
     integer("seed", args.seed, 0)
     title += f", {len(seeds)} episode{'s' * (len(seeds) > 1)} on {seed_kind(seeds)} traffic"
@@ -174,26 +186,26 @@ def compare(args: Args) -> None:
             (args.output / name).unlink(missing_ok=True)
         remove_parts(args.output)
     rows = play("evaluation", cells, seeds, place)
-    scores = score(rows, cells, args.reference)
+    scores = score(rows, cells, reference)
     draw_scores(args.output / ERRORS, title, scores, cells)
-    draw_traffic(args, title, scores, cells)
-    header, lines = make_rows(scores, args.reference)
+    shown = draw_traffic(args, title, scores, cells)
+    header, lines = make_rows(scores, reference)
     table = markdown([each.replace("\n", " ") for each in header], lines)
     of_estimator = {each.labels["estimator"]: each for each in cells}
     settings = {
         name: settings_of(each.env, each.all_keywords) for name, each in of_estimator.items()
     }
-    notes = f"{legend(seeds)}. Settings {in_force(settings)}"
+    notes = f"{legend(scores)}. Settings {in_force(settings)}"
     write_tables(args.output, f"# {title}\n\n{notes}.\n\n{table}", rows)
     page = f", {PAGE} (for a browser)" if args.html else ""
     args.answer(
         {
-            "title": title, "settings": settings, "reference": args.reference,
+            "title": title, "settings": settings, "reference": reference,
             "rows": [as_json(each) for each in scores],
         },
         f"{title}\n{notes}", make_table("", *header, left=2, rows=lines),
-        *verdicts(rows, scores, cells),
-        f"wrote {args.output}/: {TABLES}, {ERRORS} (errors), {MAPS} (queries){page}",
+        *policy_verdicts(rows, scores, cells), *estimator_verdicts(rows, scores),
+        f"wrote {args.output}/: {TABLES}, {ERRORS} (errors), {MAPS} ({shown}){page}",
     )  # fmt: skip
 
 
@@ -210,7 +222,7 @@ def make_cells(args: Args) -> tuple[str, tuple[Cell, ...]]:
         given["estimator"] = args.estimators[0]
     config = make_config(env, given)
     policies: dict[str, str] = {}
-    for source in (*(args.policies or OBSERVATION_SCHEDULES), args.reference):
+    for source in (*(args.policies or OBSERVATION_SCHEDULES), find_reference(args)):
         name = policy_name(source)
         require(policies.setdefault(name, source) == source, "policies", "of different names", name)
     cells = []
@@ -236,14 +248,27 @@ def make_cells(args: Args) -> tuple[str, tuple[Cell, ...]]:
 
 def score(rows: pl.DataFrame, cells: Sequence[Cell], reference: str) -> list[Score]:
     """Return the scores of cells, by estimator; the least errors come first."""
-    scores = []
-    for cell in cells:
-        own, other = cell.labels, {**cell.labels, "policy": policy_name(reference)}
-        means = {each: _interval(values(rows, own, each)) for each in (*METRICS, *HONESTY)}
-        differences = {
-            each: _interval(values(rows, own, each) - values(rows, other, each)) for each in METRICS
-        }
-        scores.append(Score(own["estimator"], own["policy"], means, differences))
+    names = [(str(cell.labels["estimator"]), str(cell.labels["policy"])) for cell in cells]
+    found = {
+        name: {each: values(rows, cell.labels, each) for each in (*METRICS, *HONESTY)}
+        for name, cell in zip(names, cells, strict=True)
+    }
+    worst_first = sorted(names, key=lambda name: -found[name][ERROR].mean())
+    least = {policy: estimator for estimator, policy in worst_first}
+
+    def differences(name: tuple[str, str], other: tuple[str, str]) -> dict[str, Interval]:
+        return {each: _interval(found[name][each] - found[other][each]) for each in METRICS}
+
+    scores = [
+        Score(
+            estimator,
+            policy,
+            {each: _interval(own) for each, own in found[estimator, policy].items()},
+            differences((estimator, policy), (estimator, reference)),
+            differences((estimator, policy), (least[policy], policy)),
+        )
+        for estimator, policy in names
+    ]
     scores.sort(key=lambda each: each.error)
     best = list(dict.fromkeys(each.estimator for each in scores))
     return sorted(scores, key=lambda each: best.index(each.estimator))
@@ -260,11 +285,12 @@ def _interval(values: FloatArray) -> Interval:
 def as_json(score: Score) -> dict[str, Any]:
     """Return a score as plain JSON; null stands for ends of an interval that it has not."""
     content = dataclasses.asdict(score)
-    for interval in (*content["means"].values(), *content["differences"].values()):
-        if interval["n"] == 1:
-            interval |= {"low": None, "high": None}
-        if not np.isfinite(interval["mean"]):
-            interval["mean"] = None
+    for intervals in (each for each in content.values() if isinstance(each, dict)):
+        for interval in intervals.values():
+            if interval["n"] == 1:
+                interval |= {"low": None, "high": None}
+            if not np.isfinite(interval["mean"]):
+                interval["mean"] = None
     return content
 
 
@@ -275,30 +301,38 @@ def in_words(interval: Interval, sign: str = "") -> str:
 
 
 def make_rows(scores: Sequence[Score], reference: str) -> tuple[list[str], list[list[str]]]:
-    """Return header, folded, and rows of the table."""
+    """Return header, folded, and rows of the table.
+
+    Policies are compared with the reference; a single one is, between estimators.
+    """
     header, rows = ["estimator", "policy"], [[each.estimator, each.policy] for each in scores]
-    name = policy_name(reference)
+    if len({each.policy for each in scores}) > 1:
+        other, own = reference, [(each.policy, each.differences) for each in scores]
+    else:
+        other = scores[0].estimator
+        own = [(each.estimator, each.estimator_differences) for each in scores]
     for metric in METRICS:
         header.append(error_label(metric).replace(" [", "\n["))
         for row, each in zip(rows, scores, strict=True):
             row.append(in_words(each.means[metric]))
-        if any(each.policy != name for each in scores):
-            header.append(f"against\n{name}")
-            for row, each in zip(rows, scores, strict=True):
-                less = in_words(each.differences[metric], "+")
-                row.append("-" if each.policy == name else less)
+        if len(scores) > 1:
+            header.append(f"against\n{other}")
+            for row, (name, differences) in zip(rows, own, strict=True):
+                row.append("-" if name == other else in_words(differences[metric], "+"))
     header.append("chi2 density,\nspeed")
     for row, each in zip(rows, scores, strict=True):
         row.append(", ".join(f"{each.means[name].mean:.2f}" for name in HONESTY))
     return header, rows
 
 
-def legend(seeds: Sequence[int]) -> str:
+def legend(scores: Sequence[Score]) -> str:
     """Return what the numbers of the table are."""
     several = "Mean ± half of the 95 % interval"
     one = "One episode has no interval: differences may be chance"
     chi2 = "chi2 is the squared error over its reported variance, 1 of an honest estimator"
-    return f"{several if len(seeds) > 1 else one}. {chi2}"
+    if not all(np.isfinite(each.means[name].mean) for each in scores for name in HONESTY):
+        chi2 += ", inf of one that once was certain"
+    return f"{one if scores[0].means[ERROR].n == 1 else several}. {chi2}"
 
 
 def in_force(settings: Mapping[str, str]) -> str:
@@ -306,7 +340,9 @@ def in_force(settings: Mapping[str, str]) -> str:
     return "; ".join(f"of {estimator}: {each}" for estimator, each in settings.items())
 
 
-def verdicts(rows: pl.DataFrame, scores: Sequence[Score], cells: Sequence[Cell]) -> list[str]:
+def policy_verdicts(
+    rows: pl.DataFrame, scores: Sequence[Score], cells: Sequence[Cell]
+) -> list[str]:
     """Return how the best learned policy stands to the best rule, a line for each estimator.
 
     Args:
@@ -325,9 +361,30 @@ def verdicts(rows: pl.DataFrame, scores: Sequence[Score], cells: Sequence[Cell])
         low, mean, high, side = gain.low, gain.mean, gain.high, "below"
         if mean < 0.0:
             low, mean, high, side = -high, -mean, -low, "above"
+        name = f"best rule played ({rule.policy})" if len(rules) > 1 else rule.policy
         lines.append(
-            f"{estimator}: learned ({best.policy}) {best.error:.1f}, best rule ({rule.policy}) "
-            f"{rule.error:.1f}: {mean:.1f} % {side}, 95 % interval {low:.1f} to {high:.1f}"
+            f"{estimator}: learned ({best.policy}) {best.error:.1f}, {name} {rule.error:.1f}: "
+            f"{mean:.1f} % {side}, 95 % interval {low:.1f} to {high:.1f}"
+        )
+    return lines
+
+
+def estimator_verdicts(rows: pl.DataFrame, scores: Sequence[Score]) -> list[str]:
+    """Return by how much other estimators err more than the best, a line for each policy."""
+    lines = []
+    for policy in dict.fromkeys(each.policy for each in scores):
+        best, *others = sorted(
+            (each for each in scores if each.policy == policy), key=lambda each: each.error
+        )
+        if not others or best.means[ERROR].n == 1:
+            continue
+        least = {"estimator": best.estimator, "policy": policy}
+        more = []
+        for each in others:
+            gain = below(rows, least | {"estimator": each.estimator}, least)
+            more.append(f"{each.estimator} {-gain.mean:.1f} ± {gain.half_width:.1f} %")
+        lines.append(
+            f"{policy}: {best.estimator} errs least ({best.error:.1f}); more by {', '.join(more)}"
         )
     return lines
 
@@ -355,31 +412,40 @@ def draw_scores(path: Path, title: str, scores: Sequence[Score], cells: Sequence
     save_figure(draw_errors(policies, series, log=not one), path, title)
 
 
-def draw_traffic(args: Args, title: str, scores: Sequence[Score], cells: Sequence[Cell]) -> None:
-    """Draw the first traffic seed under some policies, and write the page if it is wanted.
+def draw_traffic(args: Args, title: str, scores: Sequence[Score], cells: Sequence[Cell]) -> str:
+    """Draw the first traffic seed, write the page if it is wanted, and say in words what is shown.
 
-    They are the reference, the best other rule and the best two learned policies, with the
-    estimator of the least error.
+    A single policy is shown with the best four estimators. Of several policies the reference, the
+    best other rule and the best two learned ones are, with the estimator of the least error.
     """
     own = [each for each in scores if each.estimator == scores[0].estimator]
     known = {tuple(cell.labels.values()): cell for cell in cells}
-    reference = policy_name(args.reference)
-    learned, rules = ([e.policy for e in of if e.policy != reference] for of in _kinds(own, cells))
+    reference = policy_name(find_reference(args))
+    if len(own) == 1:
+        own, common = list(scores), own[0].policy
+        chosen = {each.estimator: (each.estimator, each.policy) for each in own[:4]}
+    else:
+        learned, rules = (
+            [each.policy for each in kind if each.policy != reference]
+            for kind in _kinds(own, cells)
+        )
+        common = own[0].estimator
+        names = (reference, *rules[:1], *learned[:2])
+        chosen = {name: (own[0].estimator, name) for name in names}
     seed = parse_seeds(args.test_seeds)[0]
-    episodes = [
-        watch(name, known[own[0].estimator, name], seed, args.records)
-        for name in (reference, *rules[:1], *learned[:2])
-    ]
+    episodes = [watch(name, known[labels], seed, args.records) for name, labels in chosen.items()]
     history = episodes[0].history
     maps = [RoadMap("true density", history.truth, history)]
     for each in episodes:
         maps.append(estimate_map(each.history, each.row[DENSITY], f"{each.name}: estimate"))
-        maps.append(RoadMap(f"{each.name}: queried", each.history.queried, each.history))
+        queried = each.history.queried
+        if each is episodes[-1] or not np.array_equal(queried, episodes[-1].history.queried):
+            maps.append(RoadMap(f"{each.name}: queried", queried, history))
     figure = draw_maps([maps])
-    save_figure(figure, args.output / MAPS, f"{title}: seed {seed}, {own[0].estimator}")
+    save_figure(figure, args.output / MAPS, f"{title}: seed {seed}, {common}")
     if args.html:
-        table = make_rows(own, args.reference)
-        write_page(args.output / PAGE, title, *table, episodes, seed)
+        write_page(args.output / PAGE, title, *make_rows(own, reference), episodes, seed)
+    return f"estimates and queries, {common}, traffic seed {seed}"
 
 
 # The suite.

@@ -104,6 +104,7 @@ def main(args: Args) -> None:
     if len(plan.envs) == 1:
         policies = [str(folder / BEST) for folder in plans]
         words = ["dptse", "evaluate", "--env", plan.envs[0], "--policies", *policies]
+        words += ["round-robin", "--reference", found["trainings"][0]["best_rule"]]
         found["next"] = shlex.join(words)
         lines.append(f"compare with rules on unseen traffic: {found['next']}")
     args.answer(found, *lines)

@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.environments import heading, make_vector
-from agents.figures import COLOURS, draw_rule, finish_figure, make_figure, save_figure
+from agents.figures import COLOURS, draw_rules, finish_figure, make_figure, save_figure
 from agents.files import write_json
 from agents.play import Cell, play
 from agents.seeds import TRAINING_VALIDATION
@@ -238,8 +238,7 @@ def draw_curve(rows: Sequence[Row], rules: Mapping[str, float]) -> Figure:
     for (column, label), colour in zip(columns, COLOURS, strict=False):
         errors = [1000.0 * row[column] for row in rows]
         axis.plot(steps, errors, color=colour, label=label, marker=".")
-    for rule, error in sorted(rules.items(), key=lambda each: each[1]):
-        draw_rule(axis, rule, 1000.0 * error)
+    draw_rules(axis, {rule: 1000.0 * error for rule, error in rules.items()})
     # What an untrained policy takes for likeliest may err far more than anything else.
     shown = [1000.0 * each for each in (*rules.values(), *map(least, rows))]
     margin = 0.1 * (max(shown) - min(shown))

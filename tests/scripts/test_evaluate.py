@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from agents import study
+from agents.statistics import mean_interval
 from agents.study import read_rows
 from dptse_env.estimators.simple import RandomWalk
 from dptse_env.evaluation import evaluate
@@ -194,6 +195,29 @@ def test_estimators_come_in_the_order_of_their_errors(tmp_path):
     for (estimator, policy), row in zip(errors, rows, strict=True):
         less = errors[estimator, policy] - errors[estimator, "round-robin"]
         assert row["differences"]["error"]["mean"] == pytest.approx(less)
+        least = min(errors[name, policy] for name in ("random_walk", "ekf"))
+        less = errors[estimator, policy] - least
+        assert row["estimator_differences"]["error"]["mean"] == pytest.approx(less)
+
+
+def test_estimators_of_a_single_policy_are_compared_with_the_best_one(tmp_path):
+    words = ["--env", f'{SHORT} {{"horizon": 80}}', "--test-seeds", "2000:2003", "--workers", "1"]
+    words += ["--policies", "none", "--estimators", "random_walk", "open_loop", "ekf"]
+    words += ["--output", tmp_path]
+    done = run_command("evaluate", *words)
+    errors = {
+        name: -1000.0 * rows_of(tmp_path).filter(estimator=name)["reward"].to_numpy()
+        for name in words[words.index("--estimators") + 1 : -2]
+    }
+    best, *others = sorted(errors, key=lambda name: errors[name].mean())
+    least, told = errors[best].mean(), []
+    for name in others:
+        more = mean_interval(100.0 * (errors[name] - errors[best]) / least)
+        told.append(f"{name} {more.mean:.1f} ± {more.half_width:.1f} %")
+    line = f"none: {best} errs least ({least:.1f}); more by {', '.join(told)}\n"
+    assert line in done.stdout
+    assert done.stdout.count("against") == 3
+    assert "(estimates and queries, none, traffic seed 2000)" in done.stdout
 
 
 def test_every_estimator_whose_settings_nobody_tuned_is_told():

@@ -47,7 +47,8 @@ def test_it_trains_and_goes_on(tmp_path):
     assert away == pytest.approx(100 * (1 - error / other), abs=0.2)
     assert done.stderr == ""
     command = shlex.split(next_step.partition(": ")[2])
-    assert command == ["dptse", "evaluate", "--env", ENV, "--policies", best]
+    compared = ["--policies", best, "round-robin", "--reference", rule]
+    assert command == ["dptse", "evaluate", "--env", ENV, *compared]
     before = (tmp_path / "one" / "policy.safetensors").read_bytes()
     assert run_command("train", *given).stdout == done.stdout
     found = json.loads(run_command("train", *given, "--json").stdout)
@@ -65,6 +66,6 @@ def test_several_seeds_are_trained_in_folders_of_their_own(tmp_path):
     best = [str(tmp_path / seed / "best.safetensors") for seed in "01"]
     *lines, next_step = done.stdout.splitlines()
     assert [line.partition(":")[0] for line in lines] == best
-    assert next_step.endswith(shlex.join(["--policies", *best]))
+    assert shlex.join(["--policies", *best, "round-robin", "--reference"]) in next_step
     first, second = (without_time(read_progress(tmp_path / seed)) for seed in "01")
     assert first[-1]["validation"] != second[-1]["validation"]
