@@ -476,7 +476,8 @@ def enter(args: Args, tasks: Sequence[str]) -> None:
     # A schedule by "module:Class" has a character that not every system allows in a path.
     own_folder = Path("results/my-suite") / entry.name.replace(":", "-")
     folder = own_folder if args.output == OUTPUT else args.output
-    require_output(folder, own=() if fresh else OWN)  # drawn traffic is drawn at this call
+    is_new = fresh and (folder / TABLES).exists()  # traffic for a finished entry is drawn anew
+    require_output(folder, own=() if is_new else [CARD])
     place = args.place(folder)
     if draws is not None:
         for path in args.beside:

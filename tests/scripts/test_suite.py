@@ -4,9 +4,12 @@ import json
 
 import pytest
 
+from agents.studies.suite import entries
 from agents.studies.suite.entries import FRESH_SEEDS
 from agents.study import ROWS, read_table
+from scripts import evaluate
 from tests.agents.studies.test_suite import SMALL, folder, small  # noqa: F401 (fixtures)
+from tests.helpers import save_untrained
 from tests.scripts.commands import refused, run_command
 
 pytestmark = pytest.mark.usefixtures("small")
@@ -50,3 +53,24 @@ def test_fresh_traffic_is_drawn_at_the_call_and_written_into_the_entry(tmp_path)
     assert {*rows["traffic_seed"]} == {*first["fresh"]}
     said = refused("evaluate", "--suite", "plain", *words, tmp_path / "a")
     assert "output must not exist yet" in said
+
+
+@pytest.mark.parametrize("fresh", [[], ["--fresh", "2"]])
+def test_an_entry_goes_on_that_was_ended_before_its_first_row(tmp_path, monkeypatch, fresh):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    policy = save_untrained(tmp_path / "best.safetensors", estimator="random_walk")
+    words = ["evaluate", "--suite", "plain", "--workers", "1", "--output", tmp_path / "out"]
+    for owner in (entries, evaluate):  # as it copies the policy, and as it plays
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, "write_atomically" if owner is entries else "play", interrupt)
+            done = run_command(*words, *fresh, "--policies", policy)
+        assert done.returncode == 130
+        assert "the same command goes on" in done.stderr
+    card = (tmp_path / "out" / "card.json").read_text()
+    others = [["--fresh", "3", "--policies", policy], [*fresh, "--policies", "random"]]
+    for other in others if fresh else others[:1]:  # other rows of the suite's traffic can stay
+        assert "output must be a folder of this entry" in refused(*words, *other)
+    assert run_command(*words, *fresh, "--policies", policy).returncode == 0
+    assert (tmp_path / "out" / "card.json").read_text() == card

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import random
 import re
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,8 @@ from agents.tables import ERROR, are_present, values_of
 from dptse_env.config import TEST_SEEDS
 from dptse_env.policies import SUFFIX, read_policy, shipped_policies
 from dptse_env.traffic import Records
-from dptse_env.utils.validation import positive, read_json, read_toml, require
+from dptse_env.utils.files import write_atomically
+from dptse_env.utils.validation import integer, positive, read_json, read_toml, require
 from dptse_env.versions import code_version
 
 CARD = "card.json"
@@ -59,7 +59,7 @@ class Entry:
         left: Why the round robin acts in some tasks, by task.
         steps: Seconds of traffic of one training, all its files together; None if not known.
         minutes: Processor minutes of one training; None if not said.
-        parameters: Numbers that are trained in one training.
+        parameters: Numbers that are trained in one training; None if not known.
         tuning: What was tried before, in words.
         reads: What the policies read.
         fresh: Traffic seeds that were drawn for it; None for those of the tasks.
@@ -70,7 +70,7 @@ class Entry:
     left: Mapping[str, str]
     steps: int | None
     minutes: float | None
-    parameters: int
+    parameters: int | None
     tuning: str
     reads: Access = "observations"
     fresh: Sequence[int] | None = None
@@ -109,7 +109,8 @@ def make_entry(policies: Sequence[str], tasks: Sequence[str]) -> Entry:
     The key ``policies`` of a file is a policy, a list with one for each training seed, or a table
     of these by task, in which ``others`` stands for the tasks that are not named (the round robin
     if absent). Paths are relative to the file. ``name``, ``minutes`` and ``tuning`` are told in
-    tables; steps and parameters are read in the files of policies.
+    tables. ``steps`` and ``parameters`` are read in the files of policies; classes have none, so
+    that their author says both here.
 
     Args:
         policies: A policy for each training seed, or the file.
@@ -126,7 +127,7 @@ def make_entry(policies: Sequence[str], tasks: Sequence[str]) -> Entry:
     if len(policies) == 1 and policies[0].endswith(".toml"):
         path, file = policies[0], Path(policies[0])
         told = read_toml(file, "entry")
-        known = ["minutes", "name", "policies", "tuning"]
+        known = ["minutes", "name", "parameters", "policies", "steps", "tuning"]
         unknown = sorted(told.keys() - set(known))
         require(not unknown, path, f"an entry with keys {known}", unknown)
         name, table = str(told.get("name", file.stem)), _table(told.get("policies"), file)
@@ -146,19 +147,23 @@ def make_entry(policies: Sequence[str], tasks: Sequence[str]) -> Entry:
             found[task], left[task] = [ROUND_ROBIN], problem
     if len(left) == len(tasks):
         raise ValueError(f"{name!r} acts in no task: {next(iter(left.values()))}")
-    steps, weights = list[int | None](), list[int]()
-    for k in range(max([*numbers, 1])):
-        taken, trained = _trained({own[k % len(own)] for own in found.values()})
-        steps.append(taken)
-        weights.append(trained)
-    known_steps = [each for each in steps if each is not None]
+    trainings = [
+        _trained({own[k % len(own)] for own in found.values()}) for k in range(max([*numbers, 1]))
+    ]
+    counts: dict[str, int | None] = {}
+    for key, read in zip(("steps", "parameters"), zip(*trainings, strict=True), strict=True):
+        sure = [each for each in read if each is not None]
+        counts[key] = max(sure) if len(sure) == len(read) else None
+        if key in told:
+            require(counts[key] is None, f"{path}: {key}", "left out, as files say it", told[key])
+            counts[key] = integer(f"{path}: {key}", told[key], 0)
     return Entry(
         name=name,
         policies=found,
         left=left,
-        steps=max(known_steps) if len(known_steps) == len(steps) else None,
+        steps=counts["steps"],
         minutes=positive(f"{path}: minutes", told["minutes"]) if "minutes" in told else None,
-        parameters=max(weights),
+        parameters=counts["parameters"],
         tuning=str(told.get("tuning", "not said")),
     )
 
@@ -181,16 +186,21 @@ def _resolved(source: str, folder: Path) -> str:
     return str(folder / source) if is_file else source
 
 
-def _trained(sources: Iterable[str]) -> tuple[int | None, int]:
-    """Return seconds of traffic and weights of a training's files; of classes, none are known."""
+def _trained(sources: Iterable[str]) -> tuple[int | None, int | None]:
+    """Return seconds of traffic and weights of a training's files, None where a class has some."""
     steps: int | None = 0
-    weights = 0
+    weights: int | None = 0
+    own: int | None
+    trained: int | None
     for source in sources:
         card = find_policy(source).card
-        own = card["training"].get("steps") if card is not None else None if ":" in source else 0
-        steps = None if own is None or steps is None else steps + int(own)
         if card is not None:
-            weights += sum(array.size for array in read_policy(source).weights.values())
+            own = card["training"].get("steps")
+            trained = sum(array.size for array in read_policy(source).weights.values())
+        else:
+            own = trained = None if ":" in source else 0
+        steps = None if own is None or steps is None else steps + int(own)
+        weights = None if trained is None or weights is None else weights + trained
     return steps, weights
 
 
@@ -235,35 +245,49 @@ def require_fair(source: str) -> None:
 def begin(entry: Entry, folder: Path, fresh: int | None, records: Records = None) -> Entry:
     """Return an entry with what it reads and maybe fresh seeds; write its card and files.
 
+    An entry that was begun on fresh traffic goes on with the seeds of its card.
+
     Args:
         entry: From `make_entry`.
         folder: The folder of its results.
         fresh: Number of traffic seeds that are drawn; None to play those of the tasks.
         records: Folder of the record cache; None for the user's cache.
+
+    Raises:
+        ValueError: The folder has something that is no card, or the card of an entry on other
+            traffic, or of other policies on fresh traffic.
     """
     first = {source: task for task, own in entry.policies.items() for source in own}
+    names = {source: _name_there(source) for source in first}
+    told = {task: [names[each] for each in own] for task, own in entry.policies.items()}
+    drawn = None if fresh is None else sorted(random.SystemRandom().sample(FRESH_SEEDS, fresh))
+    if (folder / CARD).exists():
+        kept = read_entry(folder / CARD)
+        fits = (None if kept.fresh is None else len(kept.fresh)) == fresh
+        if fits and fresh is not None:
+            fits, drawn = kept.policies == _table(told, folder / CARD), list(kept.fresh or ())
+        require(fits, "output", "a folder of this entry, or a new one", str(folder))
     reads = {access_of(make_cell(task, source), records) for source, task in first.items()}
     order: tuple[Access, ...] = ("truth", "process", "observations")
-    drawn = None if fresh is None else sorted(random.SystemRandom().sample(FRESH_SEEDS, fresh))
-    folder.mkdir(parents=True, exist_ok=True)
-    copied = {source: _copied(source, folder) for source in first}
-    told = {task: [copied[each] for each in own] for task, own in entry.policies.items()}
     entry = dataclasses.replace(
         entry, reads=next(each for each in order if each in reads), fresh=drawn
     )
     about = {"suite": NAME, "package": code_version(), "track": entry.track}
+    folder.mkdir(parents=True, exist_ok=True)
+    # The card is the first file, by which an interrupted entry is known.
     write_json(folder / CARD, about | dataclasses.asdict(entry) | {"policies": told})
+    for source, name in names.items():
+        target = folder / name
+        if name != source and not target.exists():
+            target.parent.mkdir(exist_ok=True)
+            write_atomically(target, Path(source).read_bytes())
     return entry
 
 
-def _copied(source: str, folder: Path) -> str:
-    """Copy the file of a policy into a folder, and return its name from there."""
+def _name_there(source: str) -> str:
+    """Return what a policy is called in the folder of an entry, which has a copy of its file."""
     if source.endswith(SUFFIX) and source not in shipped_policies():
-        target = folder / "policies" / f"{find_policy(source).identity[:16]}{SUFFIX}"
-        target.parent.mkdir(exist_ok=True)
-        if not target.exists():
-            shutil.copy(source, target)
-        return target.relative_to(folder).as_posix()
+        return f"policies/{find_policy(source).identity[:16]}{SUFFIX}"
     return source
 
 

@@ -184,11 +184,17 @@ def test_a_file_names_policies_by_task(small, tmp_path):
         ('policies = ["static", "static"]', "different"),
         ('polices = "static"', r"an entry with keys .*polices"),
         ('policies = "static"\nminutes = -1', "minutes"),
+        ('policies = "static"\nparameters = 9', "parameters must be left out"),
         ("policies = 3", "policies"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
             make_entry([str(path)], list(SMALL))
+    entry = make_entry([f"{__name__}:Peeking"], list(SMALL))
+    assert (entry.steps, entry.parameters, entry.track) == (None, None, "unlimited")
+    path.write_text(f'policies = "{__name__}:Peeking"\nsteps = 5_000\nparameters = 9')
+    entry = make_entry([str(path)], list(SMALL))
+    assert (entry.steps, entry.parameters, entry.track) == (5000, 9, "1 million")
     with pytest.raises(FileNotFoundError, match="nobody"):
         make_entry(["nobody.safetensors"], list(SMALL))
     with pytest.raises(ValueError, match="'nobody' acts in no task"):
