@@ -43,6 +43,11 @@ from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
 from dptse_env.utils.validation import integer, require
 
+told = logging.getLogger("dptse")
+
+ROUND = 4
+"""Records of each process after which a file is told of them."""
+
 MOST_WORKERS = 10_000
 """Most processes of this machine that may be asked for."""
 
@@ -204,8 +209,20 @@ class Recording:
     def library(self, corridor: Corridor, seeds: Sequence[int]) -> RecordLibrary:
         """Return the library of records, after recording what is missing."""
         library = RecordLibrary(self.records)
+        if not sys.stderr.isatty():  # which a bar is for
+            self._record_in_rounds(corridor, library.missing(corridor, seeds), library)
         record(corridor, seeds, library, progress=True, workers=self.workers)
         return library
+
+    def _record_in_rounds(
+        self, corridor: Corridor, missing: Sequence[int], library: RecordLibrary
+    ) -> None:
+        """Record traffic, and tell after every round how much of it there is."""
+        size = ROUND * (n_cores() if self.workers is None else self.workers)
+        for first in range(0, len(missing) - size, size):
+            seeds = missing[first : first + size]
+            record(corridor, seeds, library, progress=True, workers=self.workers)
+            told.info("recorded %d of %d", first + size, len(missing))
 
 
 @dataclass(frozen=True)
@@ -314,11 +331,13 @@ def _said(is_said: bool) -> Iterator[None]:
     root = logging.getLogger()
     before = root.level
     root.setLevel(logging.WARNING if is_said else logging.ERROR)
+    told.setLevel(logging.INFO if is_said else logging.ERROR)
     progress.set_quiet(not is_said)
     try:
         yield
     finally:
         root.setLevel(before)
+        told.setLevel(logging.NOTSET)
         progress.set_quiet(False)
 
 
@@ -401,13 +420,13 @@ def warnings_told_once() -> Iterator[None]:
 
     Python's own record of what it has shown is forgotten whenever somebody changes a filter.
     """
-    told, before = set(), warnings.showwarning
+    texts, before = set(), warnings.showwarning
 
     def tell(message: Warning | str, *_: Any, **__: Any) -> None:
         text = str(message)
-        if text not in told:
-            told.add(text)
-            logging.getLogger("dptse").warning("warning: %s", text)
+        if text not in texts:
+            texts.add(text)
+            told.warning("warning: %s", text)
 
     warnings.showwarning = tell
     try:

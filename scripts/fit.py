@@ -75,6 +75,12 @@ class Args(
 ):  # fmt: skip
     """Fit a road."""
 
+    train_seeds: Annotated[str | None, arg(metavar="STR")] = None
+    """Traffic seeds to fit to, of 0 to 999; 0:8 if not given."""
+    validation_seeds: Annotated[str | None, arg(metavar="STR")] = None
+    """Seeds to choose on, of 1000 to 1999; 1000:1016 if not given."""
+    test_seeds: Annotated[str | None, arg(metavar="STR")] = None
+    """Seeds of the results, of 2000 to 2999; 2000:2016 if not given."""
     road: Annotated[Path | None, Positional, arg(metavar="[ROAD]")] = None
     """Road file, of a road of your own, an import or a SUMO network."""
     env: str = "dptse_env:dptse/PrivateHighway-v1"
@@ -201,6 +207,12 @@ def fit_road(args: Args, path: Path) -> None:
 
     keywords = chosen_keywords(choice, road)
     choice.notes += [*inherits(choice, keywords), *road.remarks]
+    if road.is_of_records and road.config.release_model.claims_guarantee:
+        choice.notes.append(
+            f"{path} names under `measured` what depends on the vehicles of its records, which "
+            "voids the guarantee for them. To have one, release only other traffic, such as "
+            "another day's, and empty `measured`"
+        )
     n = road.corridor.geometry.n_mainline
     sets = {
         each: choice.cell(choice.labels("test", parameters=each)).config.parameters
@@ -213,6 +225,7 @@ def fit_road(args: Args, path: Path) -> None:
         path,
         {key: _in_file(path, value) for key, value in keywords.items()},
         dwell if "average_dwell" in road.assumed else None,
+        of_records=road.is_of_records,
     )
     said = [verdict(choice), *(f"- {each}" for each in (reason(choice), *choice.notes))]
     if changed:
@@ -319,6 +332,12 @@ def note_parameters(choice: Choice, fit: Fit) -> None:
         f"on training traffic the search took the error x 1000 of an EKF from {fit.start:.1f}, "
         f"with {fit.parameters.derived_from}, to {fit.error:.1f}"
     )
+    v_f, limit = fit.parameters.free_flow_speed, choice.road.corridor.geometry.largest_speed_limit
+    if v_f > limit and not any("free_flow_speed" in each for each in fit.at_bounds):
+        choice.notes.append(
+            f"v_f is {v_f:g} km/h where {limit:g} are allowed: it extrapolates the curve to an "
+            "empty road, gamma and the jam density compensate it, and nobody drives at it"
+        )
     own, other = (
         choice.labels("validation", parameters=each) for each in (name, choice.parameters)
     )
@@ -337,7 +356,12 @@ def chosen_keywords(choice: Choice, road: Road) -> dict[str, Any]:
     chosen = choice.sets[choice.parameters]
     if chosen.get("parameters") == road.inherited:
         chosen = {}
-    return {**decided, **chosen, "estimator": choice.estimator}
+    return {
+        **decided,
+        **road.fusion_of(choice.estimator),
+        **chosen,
+        "estimator": choice.estimator,
+    }
 
 
 def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:

@@ -9,6 +9,7 @@ a shipped set, and the filter has the tuned settings of that set, which the fitt
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,11 @@ from dptse_env.utils.validation import read_json
 
 FIELDS = ("free_flow_speed", "jam_density", "gamma", "relaxation_time")
 """Parameters that are searched, the jam density for one lane."""
+
+told = logging.getLogger("dptse")
+
+TOLD = 20
+"""Trials after which a file, which has no bar, is told of them."""
 
 _WIDTH = 0.2  # first steps of the search, as shares of the values
 _REFUSED = 1e4  # error x 1000 of parameters that violate the CFL condition
@@ -164,6 +170,8 @@ def fit_parameters(
             write_json(kept, [[*each, error] for each, error in tried.items()])
         shown.update()
         shown.set_postfix_str(f"error {min(tried.values()):.1f}")
+        if shown.disable and len(tried) % TOLD == 0:
+            told.info("tried %d of %d, error x 1000 %.1f", len(tried), trials, min(tried.values()))
         return tried[key]
 
     per_lane = start.jam_density / start.lanes

@@ -24,17 +24,20 @@ def copy_of(path: Path) -> Path:
     return path.with_name(f"{path.stem}.before-fit{path.suffix}")
 
 
-def write_choice(path: Path, keywords: Mapping[str, Any], dwell: float | None) -> bool:
+def write_choice(
+    path: Path, keywords: Mapping[str, Any], dwell: float | None, *, of_records: bool
+) -> bool:
     """Put keywords into the table of a road file, and keep a copy of the file as it was.
 
     Comments, order and all other values stay. Of the keywords that a fit decides, those that are
-    not given go. The names of what is written stand under ``measured``, since it depends on the
-    records.
+    not given go.
 
     Args:
         path: The road file.
         keywords: Keywords of an environment.
         dwell: Average dwell [s] of a file that has none; None to leave it as it is.
+        of_records: Whether all of this depends on vehicles that files have. Its names then stand
+            under ``measured``, which voids the guarantee.
 
     Returns:
         Whether the file is another one now.
@@ -45,9 +48,13 @@ def write_choice(path: Path, keywords: Mapping[str, Any], dwell: float | None) -
     """
     text = path.read_bytes().decode("utf-8")
     expected = tomllib.loads(text)
-    measured = [*expected.get(MEASURED, ()), *([] if dwell is None else [DWELL]), *keywords]
-    expected[MEASURED] = list(dict.fromkeys(measured))
-    new = _changed(text, keywords, dwell, expected[MEASURED])
+    measured = list(expected.get(MEASURED, ()))
+    if of_records:
+        named = [*measured, *([] if dwell is None else [DWELL]), *keywords]
+        measured = list(dict.fromkeys(named))
+    if measured:
+        expected[MEASURED] = measured
+    new = _changed(text, keywords, dwell, measured)
     table = {k: v for k, v in expected.get(TABLE, {}).items() if k not in CHOSEN}
     expected[TABLE] = {**table, **keywords}
     if dwell is not None:
@@ -67,7 +74,7 @@ def _changed(
 ) -> str:
     document = tomlkit.parse(text)
     is_new = MEASURED not in document
-    if not is_new and document[MEASURED] != measured:
+    if measured and not is_new and document[MEASURED] != measured:
         document[MEASURED] = measured
     table: Any = document.setdefault(TABLE, tomlkit.table())
     for key in CHOSEN:
@@ -81,6 +88,6 @@ def _changed(
     first = next(k for k, line in enumerate(lines) if line.strip() and line.lstrip()[0] != "#")
     end = "\r\n" if lines[first].endswith("\r\n") else "\n"
     added = [] if dwell is None else [f"{DWELL} = {dwell:g}  # measured by dptse fit [s]{end}"]
-    if is_new:
+    if measured and is_new:
         added.append(f"{MEASURED} = {json.dumps(measured)}  # on the records of this road{end}")
     return "".join([*lines[:first], *added, *lines[first:]])

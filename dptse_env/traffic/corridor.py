@@ -181,8 +181,8 @@ class Corridor:
         fixed_sensors: indices of the segments measured at every step.
         loops: stations of loops at borders of segments; None for none.
         measured: names of fields of the parts, and of keywords of an environment, whose values were
-            measured on the records of this road, as imports and ``dptse fit`` write down. They void
-            a guarantee for the vehicles of these records.
+            measured on vehicles of files, as imports and fits of these write down. They void a
+            guarantee for the vehicles of these records.
 
     Raises:
         ValueError: Demand, incident, sensors or files do not fit the road, or both `sumo` and

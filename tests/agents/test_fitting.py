@@ -83,7 +83,9 @@ def test_the_file_has_the_choice_and_keeps_all_else(fitted):
     content = tomllib.loads(text)
     assert content["environment"]["estimator"] == found["estimator"]
     assert 3.0 < content["average_dwell"] < 10.0
-    assert set(content["measured"]) >= {"average_dwell", *content["environment"]}
+    # SUMO drew the vehicles: they are nobody's, and the guarantee stands.
+    assert "measured" not in content
+    assert gym.make(ID, corridor=str(path)).unwrapped.guarantee().startswith("2.1181-Gaussian")
 
 
 def test_the_environment_has_the_set_of_the_file_by_its_name(fitted):
@@ -378,7 +380,7 @@ def test_a_choice_is_written_whatever_the_file_looks_like(text, tmp_path):
     chosen = {"parameters": "fit/a.json", "estimator": "ekf"}
     link = tmp_path / "link.toml"
     link.symlink_to(path)
-    assert write_choice(link, chosen, 9.8)
+    assert write_choice(link, chosen, 9.8, of_records=True)
     assert copy_of(link) == tmp_path / "road.before-fit.toml"
     assert copy_of(path).read_bytes() == text.encode()
     new, old = tomllib.loads(path.read_bytes().decode()), tomllib.loads(text)
@@ -388,9 +390,10 @@ def test_a_choice_is_written_whatever_the_file_looks_like(text, tmp_path):
     table.pop("estimator_settings", None)
     assert new.pop("environment") == {**table, **chosen}
     assert new == old
-    assert not write_choice(path, chosen, None)
+    assert not write_choice(path, chosen, None, of_records=False)
     assert copy_of(path).read_bytes() == text.encode()
-    assert write_choice(path, {"estimator": "ukf", "estimator_settings": "x.json"}, None)
+    ukf = {"estimator": "ukf", "estimator_settings": "x.json"}
+    assert write_choice(path, ukf, None, of_records=True)
     measured = tomllib.loads(path.read_bytes().decode())["measured"]
     assert measured == ["average_dwell", "parameters", "estimator", "estimator_settings"]
 
@@ -414,6 +417,29 @@ def test_a_road_that_cannot_be_fitted_is_told_and_leaves_nothing(text, message, 
     path.write_text(text)
     assert message in refused("fit", path)
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("table", "keywords", "factors"),
+    [
+        ("penetration = 0.3", "{}", (1.0, 0.0)),
+        ("penetration = 0.3\nfusion.speed_spread = 9", "{}", (1.0, 0.0)),
+        # What a fit has left is decided again; what somebody chose is not.
+        ('penetration = 0.3\nestimator = "recurrent"\nfusion.dwell_factor = 1', "{}", (1.0, 0.0)),
+        ("penetration = 0.3\nfusion.dwell_factor = 1", "{}", (1, 1)),
+        ("penetration = 0.3", '{"fusion": {"dwell_factor": 2}}', (2, 2)),
+        ("", "{}", (None, None)),
+    ],
+)
+def test_each_estimator_has_the_dwell_factor_that_suits_it(table, keywords, factors, tmp_path):
+    path = tmp_path / "my-road.toml"
+    path.write_text(f"{ROAD}\n[environment]\n{table}\n")
+    road = find_road(path, f"{ID} {keywords}", tmp_path, dict.fromkeys(KINDS))
+    choice = Choice(road, Place(tmp_path, this_process), {})
+    cells = (choice.cell(choice.labels("test", estimator=each)) for each in ("recurrent", "ekf"))
+    fusions = [cell.keywords.get("fusion", {}) for cell in cells]
+    assert tuple(each.get("dwell_factor") for each in fusions) == factors
+    assert all(each.get("speed_spread", 9) == 9 for each in fusions)
 
 
 def import_field(folder, windows):

@@ -25,10 +25,12 @@ def test_what_an_environment_replays_is_recorded(tmp_path):
 
 
 def test_records_for_programs(tmp_path):
-    seeds = "--train-seeds", "0:2", "--test-seeds", "2000"
+    seeds = "--train-seeds", "0:4", "--test-seeds", "2000"
     words = "--env", SHORT, "--records", tmp_path, *seeds, "--workers", "1"
-    found = json.loads(run_command("record", *words, "--json").stdout)
-    assert found["seeds"] == [0, 1, 2000]
+    done = run_command("record", *words, "--json")
+    assert done.stderr.splitlines()[:1] == ["recorded 4 of 5"]
+    found = json.loads(done.stdout)
+    assert found["seeds"] == [0, 1, 2, 3, 2000]
     names = sorted(path.name for path in Path(found["folder"]).glob("0*"))
-    assert names == [f"0000{seed}.safetensors" for seed in ("0000", "0001", "2000")]
+    assert names == [f"0000{seed}.safetensors" for seed in ("0000", "0001", "0002", "0003", "2000")]
     assert found["dwell"] > 0.0
