@@ -87,8 +87,8 @@ def evaluate(
         noise_seed: Noise and estimator are seeded with this plus the traffic seed, and the choices
             of a schedule that draws with this alone.
         warm_up: Seconds at the start of an episode that do not count [s].
-        deterministic: Whether the policy is asked for its likeliest action; None for what it says
-            itself, a saved one by its card, and for the likeliest of one that says nothing.
+        deterministic: Whether the policy is asked for its likeliest action. By default a saved
+            one is asked for what its card says, and any other for its likeliest action.
         watchers: Make objects that add columns to the rows.
 
     Returns:

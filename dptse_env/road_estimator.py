@@ -71,9 +71,9 @@ _NOTHING = Additions(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 
 class RoadEstimator:
     """An estimator on a road, second by second, from whatever came in.
 
-    Ends of the road and of its ramps have the traffic that sources beside them said last, within
-    ten minutes. Where none did, vehicles enter at the demand that the road file publishes. Its
-    first second is the stream's, and its last one goes on. Behind an exit that nobody sees, traffic
+    At the ends of the road and of its ramps there is the traffic that sources beside them said
+    last, within ten minutes. Where none did, vehicles enter at the demand of the road file, which
+    begins with the stream, and whose last value goes on. Behind an exit that nobody sees, traffic
     is as before it.
 
     Attributes:
