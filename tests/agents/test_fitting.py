@@ -117,6 +117,8 @@ def test_the_page_shows_what_was_compared_budgets_figures_and_commands(fitted):
         assert text in page
     assert f"**{found['policy']}**" in page
     assert all(note in page for note in found["notes"])
+    unwritten = any("fitted parameters are not written" in note for note in found["notes"])
+    assert unwritten == (found["parameters"] != "my-road")
     compared = found["validation"]["estimator"]
     assert {(each["estimator"], each["parameters"]) for each in compared} == {
         *product(("ekf", "random_walk"), ("w99-3lane", "my-road"))

@@ -1,7 +1,5 @@
 """Policies by name: saved ones, schedules, and classes."""
 
-import subprocess
-import sys
 from typing import ClassVar
 
 import gymnasium as gym
@@ -93,17 +91,6 @@ def test_a_card_without_recipe_and_training_seed_does(tmp_path):
     path = save_untrained(tmp_path / "policy.safetensors")
     path.write_bytes(edited(path, lambda card, weights: card.update(training={})))
     assert find_policy(str(path)).load(gym.make(SHORT, action="slots"))
-
-
-@pytest.mark.slow
-def test_a_card_is_read_without_torch(tmp_path):
-    path = save_untrained(tmp_path / "policy.safetensors")
-    code = (
-        "import sys; import scripts.evaluate; from agents.policies import find_policy; "
-        f"assert find_policy({str(path)!r}).card['fits']['action'] == 'slots'; "
-        "assert 'torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_a_schedule_of_a_module_is_told_apart_by_its_code(tmp_path, monkeypatch):

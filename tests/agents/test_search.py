@@ -117,11 +117,6 @@ def run(folder, n_trials, search=None, executor=this_process):
     return tune(search or made_up(), folder / JOURNAL, n_trials, executor)
 
 
-def finished(study):
-    trials = [t for t in study.get_trials() if t.state.name in ("COMPLETE", "PRUNED")]
-    return [(t.state, t.params, t.intermediate_values, t.user_attrs) for t in trials]
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A study of 60 trials of one worker; leave it alone."""
@@ -149,31 +144,6 @@ def test_the_defaults_and_the_present_set_come_first_and_bad_trials_stop_early(w
     assert stopped
     assert all(len(t.intermediate_values) < 3 for t in stopped)
     assert not any("label" in t.user_attrs for t in others)
-
-
-@pytest.mark.parametrize("batch", [1, 13])
-def test_a_search_that_was_interrupted_comes_out_as_one_that_was_not(
-    batch, whole, tmp_path, monkeypatch
-):
-    played, play = [], MadeUp.play
-
-    def interrupted(search, settings, seeds):
-        if len(played) == batch:
-            raise KeyboardInterrupt
-        played.append(seeds)
-        return play(search, settings, seeds)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(MadeUp, "play", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            run(tmp_path, 20)
-    with (tmp_path / JOURNAL).open("a") as file:
-        file.write('{"op_code": 4, "wor')
-    assert n_finished(run(tmp_path, 12)) == 12
-    study = run(tmp_path, 20)
-    assert finished(study) == finished(whole)[:20]
-    n_trials = len(study.get_trials())
-    assert len(run(tmp_path, 20).get_trials()) == n_trials
 
 
 def test_a_score_that_is_not_finite_is_never_the_best(tmp_path):

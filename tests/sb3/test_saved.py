@@ -178,6 +178,7 @@ def test_the_card_describes_the_policy(stored):
     file = read_policy(stored)
     assert file.card["fits"]["corridor"] == config.corridor.digest
     assert file.card["fits"]["bandwidth"] == 2
+    assert file.card["acts"] == "deterministic"
     assert file.card["keywords"] == {"estimator": "ekf"}
     assert file.card["trained_on"] == (
         "short-highway (6 mainline segments of 0.1 km, 2 lanes, fixed sensors on [5, 7])"

@@ -1,18 +1,14 @@
 """Evaluation by the command: the same numbers in tables, Markdown, JSON and rows."""
 
-import errno
 import json
-import signal
 import warnings
 from itertools import groupby
-from pathlib import Path
 
 import gymnasium as gym
 import polars as pl
 import pytest
 from PIL import Image
 
-from agents import study
 from agents.statistics import mean_interval
 from agents.study import read_rows
 from dptse_env.estimators.simple import RandomWalk
@@ -97,54 +93,23 @@ def test_one_episode_has_no_interval(tmp_path):
     assert "1 episode on test traffic" in tables
 
 
-def test_it_goes_on_wherever_it_was_ended(tmp_path, monkeypatch):
-    out, played, play_cell = tmp_path / "out", [], study._play_cell
-    env = f'{SHORT} {{"estimator": "random_walk", "horizon": 64}}'
-    words = ["evaluate", "--env", env, "--test-seeds", "2000:2002", "--workers", "1"]
-    words += ["--policies", "none", "shift-ahead", "--output", out]
-
-    def play_two(*given):
-        played.append(given)
-        if len(played) == 3:
-            signal.raise_signal(signal.SIGTERM)
-        return play_cell(*given)
-
-    def full(path, content):
-        if path.name.startswith(".rows"):
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return write_bytes(path, content)
-
+def test_what_is_begun_anew_leaves_no_results_that_do_not_describe_it(tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    write_bytes, handler = Path.write_bytes, signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(study, "_play_cell", play_two)
-    done = run_command(*words)
-    assert (done.returncode, len(played)) == (143, 3)
-    assert "the same command goes on from what is done" in done.stderr
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", full)
-        done = run_command(*words)
-    assert (done.returncode, len(played)) == (1, 4)
-    assert done.stderr.splitlines()[-1] == f"error: {out / 'rows.parquet'}: No space left on device"
+    env = f'{SHORT} {{"estimator": "random_walk", "horizon": 64}}'
+    words = ["evaluate", "--env", env, "--workers", "1", "--policies", "none"]
+    words += ["--output", tmp_path, "--test-seeds"]
+    assert run_command(*words, "2000:2002").returncode == 0
     with monkeypatch.context() as patch:
         patch.setattr(evaluate_script, "draw_traffic", interrupt)
-        assert run_command(*words).returncode == 130
-    assert not (out / "tables.md").exists()
-    assert run_command(*words).returncode == 0
-    assert len(played) == 4
-    names = {"rows.parquet", "errors.png", "space_time.png", "tables.md"}
-    assert {path.name for path in out.iterdir()} == names
-    assert signal.getsignal(signal.SIGTERM) == handler
-    with monkeypatch.context() as patch:  # what is begun anew, the old results do not describe
-        patch.setattr(evaluate_script, "draw_traffic", interrupt)
-        assert "begins anew" in run_command(*words, "--force").stderr
-    assert {path.name for path in out.iterdir()} == {"rows.parquet", "errors.png"}
-    assert len(played) == 7
-    words[words.index("2000:2002")] = "2001"  # what is left has another seed, which is not asked
-    found = json.loads(run_command(*words, "--json").stdout)
+        done = run_command(*words, "2000:2002", "--force")
+    assert done.returncode == 130
+    assert "begins anew" in done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"rows.parquet", "errors.png"}
+    # What is left has another seed too, which is not asked for.
+    found = json.loads(run_command(*words, "2001", "--json").stdout)
     assert {row["means"]["error"]["n"] for row in found["rows"]} == {1}
-    assert len(played) == 7
 
 
 def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):

@@ -5,15 +5,13 @@ import re
 import shlex
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.environments import parse_env
 from dptse_env.traffic import Demand, RecordLibrary, read_corridor
 from tests.helpers import ROOT, make_env
 from tests.importers.data import STRAIGHT, driven, plain, stream, write_csv
-from tests.importers.sumo_net.conftest import PATH, motorway, netconvert
+from tests.importers.sumo_net.conftest import PATH, motorway
 from tests.importers.test_fields import write
 from tests.importers.test_tables import FOOT, ngsim
 from tests.scripts.commands import refused, run_command
@@ -61,22 +59,6 @@ def test_trajectories_become_a_road_that_the_other_commands_take(road, tmp_path)
     # A folder of records is never replaced.
     assert "output" in refused("import", *words, "--format", "table", "--columns", *columns)
     assert new.is_file()
-
-
-def test_files_that_overlap_in_time_and_rows_that_are_left_out_are_told(road, tmp_path):
-    points = stream(seconds=65.0) + np.array([0, 1.7e9, 0, 0])
-    files = [
-        plain(tmp_path / "a.csv", np.concatenate([points, points[:5]])),
-        plain(tmp_path / "b.csv", points + np.array([0, 40, 0, 0])),
-    ]
-    words = (
-        "trajectories", "--env", on(road), "--output", tmp_path / "new", "--format", "table",
-        "--columns", "time=t", "vehicle=id", "x=s", "speed=v", "--files",
-    )  # fmt: skip
-    printed = run(*words, *files)
-    assert "a.csv: 5 dropped: duplicates of another row\n" in printed
-    assert "note: a.csv and b.csv overlap in time, from 1700000040 s on: " in printed
-    assert refused("import", *words, *files, files[0]).startswith("error: files must be given once")
 
 
 def test_a_mapping_describes_the_data(road, tmp_path):
@@ -216,29 +198,3 @@ def test_a_network_becomes_a_road_of_any_environment(town):
     for _ in range(60):
         *_, info = env.step(env.action_space.sample())
     assert info["n_occupied"] > 5
-
-
-NODES = """<nodes>
-    <node id="a" x="0" y="0"/> <node id="b" x="600" y="0"/> <node id="c" x="1200" y="0"/>
-    <node id="d" x="530" y="-42"/>
-</nodes>"""
-EDGES = """<edges>
-    <edge id="m1" from="a" to="b" numLanes="2" speed="36"/>
-    <edge id="m2" from="b" to="c" numLanes="2" speed="36"/>
-    <edge id="on" from="d" to="b" numLanes="1" speed="14" length="{}"/>
-</edges>"""
-
-
-def test_what_is_imported_can_be_played_as_the_last_line_says(tmp_path):
-    routes = tmp_path / "road.rou.xml"
-    routes.write_text('<routes><flow id="f" from="m1" to="m2" end="60" period="4"/></routes>')
-    words = "network", "--net", tmp_path / "road.net.xml", "--routes", routes, "--path", "m1 m2"
-    more = "--segment-length", "300", "--duration", "60", "--output", tmp_path / "road"
-    netconvert(tmp_path, NODES, EDGES.format(76), "<connections/>")
-    assert " of the 87.4 m for a segment and a boundary" in refused("import", *words, *more)
-    netconvert(tmp_path, NODES, EDGES.format(81), "<connections/>")
-    *_, last = run(*words, *more).splitlines()
-    env, keywords = parse_env(shlex.split(last)[shlex.split(last).index("--env") + 1])
-    with pytest.warns(UserWarning, match="values measured or tuned on"):
-        made = gym.make(env, **keywords)
-    assert made.unwrapped.config.corridor.geometry.n_mainline == 2
