@@ -8,9 +8,8 @@ import pytest
 import qpsolvers
 
 from dptse_env.estimators import BACKENDS, EstimatorSettings, HorizonSettings
-from dptse_env.estimators import reference as reference_module
 from dptse_env.estimators.mhe import normalised_bounds
-from dptse_env.estimators.reference import natural_residual, solve
+from dptse_env.estimators.reference import solve
 from dptse_env.estimators.window import ACTIVE_SET, NEWTON
 from dptse_env.utils.kernels import Bundle
 from tests.helpers import UNEVEN, fast_and_slow, pairwise
@@ -211,36 +210,3 @@ def test_what_is_not_solved_leaves_the_prediction_and_a_flag(solver, monkeypatch
     assert not mhe.fallback.any()
     if solver is None:
         assert_minimal(mhe)
-
-
-def test_what_lacks_digits_is_polished_and_what_is_false_is_refused(monkeypatch):
-    rng, n = np.random.default_rng(0), 30
-    root = rng.normal(size=(n, n))
-    H, q = root @ root.T + np.eye(n), 10.0 * rng.normal(size=n)
-    lower, upper = np.zeros(n), np.full(n, 0.3)
-    right = solve(H, q, lower, upper)
-    assert natural_residual(H, q, lower, upper, right) < 1e-12
-    assert ((right == lower) | (right == upper)).sum() >= 5
-
-    def solved(answer):
-        solution = qpsolvers.Solution(None, x=answer, found=True)
-        monkeypatch.setattr(qpsolvers, "solve_problem", lambda *_, **__: solution)
-        return solve(H, q, lower, upper)
-
-    np.testing.assert_allclose(solved(right + 1e-4), right, atol=1e-12)
-    for false in (0.5 * upper, upper):
-        assert solved(false) is None
-    monkeypatch.setattr(reference_module, "POLISHES", 0)
-    assert solved(right + 1e-4) is None
-
-
-def test_the_residual_tells_an_optimum_from_a_corner():
-    H, q = np.diag([1.0, 2.0]), np.array([-4.0, 4.0])
-    lower, upper = np.zeros(2), np.ones(2)
-    for z, residual in (([1.0, 0.0], 0.0), ([0.0, 0.0], 1.0), ([np.nan, 0.0], np.nan)):
-        found = natural_residual(H, q, lower, upper, np.array(z))
-        np.testing.assert_equal(found, residual)
-    # z_0 + z_1 = 1 is optimal everywhere: solved or refused, and never raises.
-    H, q, lower, upper = np.ones((2, 2)), np.full(2, -2.0), np.full(2, -10.0), np.full(2, 10.0)
-    z = solve(H, q, lower, upper)
-    assert z is None or natural_residual(H, q, lower, upper, z) < 1e-8

@@ -159,21 +159,7 @@ def test_what_a_measurement_leaves_out_is_filled_in_and_boundary_columns_are_lef
     assert [array.shape for array in own] == [(2, 5), (2, 5, 2), (2, 5, 2), (2, 4)]
 
 
-# Streams ------------------------------------------------------------------------------------------
-
-
-@over()
-def test_the_seed_decides_in_every_episode(name, backend, release):
-    n_steps = steps_of(name, backend, 20)
-    episodes = simulate(n_steps=n_steps, release=release)
-    first, other = (started(name, backend, episodes, seed=seed) for seed in (0, 1))
-    for estimator in (first, other):
-        run(estimator, episodes, range(n_steps))
-    found, draws = show(first), name == "enkf"
-    assert np.array_equal(found.density, show(other).density) != draws
-    first.reset(episodes.everyone, episodes.start, random_streams(1))
-    run(first, episodes, range(n_steps))
-    assert_same(show(first), found)
+# Memory -------------------------------------------------------------------------------------------
 
 
 REMEMBERING = [case for case in CASES if case[1] == "compiled"]

@@ -137,12 +137,3 @@ def test_density_stays_positive_and_w_within_its_bounds(road, parameters, seed, 
         assert np.all(w <= before.max(axis=1, keepdims=True) + 1e-9)
         if largest_w == 1.0:
             assert np.all(rho * model.pressure(rho) - psi <= 1e-9 * parameters.jam_density * v_f)
-
-
-def test_an_empty_road_stays_empty_and_finite():
-    model = ARZModel(HIGHWAY.road, PUBLISHED)
-    states = np.zeros((1, model.n_states))
-    inputs = model.boundary_inputs(np.zeros((1, 6)), np.full((1, 6), np.nan))
-    np.testing.assert_array_equal(model.step(states, inputs), states)
-    assert np.all(np.isfinite(model.jacobian(states, inputs)))
-    np.testing.assert_array_equal(model.speed(states), PUBLISHED.free_flow_speed)

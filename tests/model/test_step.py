@@ -1,8 +1,5 @@
 """The compiled step, its Jacobian and its rows of measurements beside the oracle and the model."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -61,23 +58,6 @@ def test_standing_traffic_takes_the_derivative_of_moving_traffic():
     np.testing.assert_allclose(below, at, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(above, at, rtol=1e-9, atol=1e-9)
     assert (at[0, 2 * np.arange(14), 2 * np.arange(1, 15) + 1] != 0.0).all()
-
-
-def test_a_batch_equals_a_loop_a_copy_and_a_kernel_that_overwrites_its_state_to_the_bit():
-    model, rng = ARZModel(HIGHWAY.road, W99, demand_memory=20.0), np.random.default_rng(8)
-    states, inputs = random_states(model, 16, rng), random_inputs(model, 16, rng)
-    kept = states.copy()
-    after, jacobian = model.step(states[::2], inputs[::2]), model.jacobian(states[::2], inputs[::2])
-    np.testing.assert_array_equal(states, kept)
-    copies = copy.deepcopy(model), pickle.loads(pickle.dumps(model))
-    for i, one in enumerate(range(0, 16, 2)):
-        row = [one]
-        for other in (model, *copies):
-            np.testing.assert_array_equal(other.step(states[row], inputs[row])[0], after[i])
-        np.testing.assert_array_equal(model.jacobian(states[row], inputs[row])[0], jacobian[i])
-        state, blocks = states[one].copy(), np.empty((*model.road.neighbours.shape, 4))
-        advance(model.road, model.arz, state, inputs[one], state, blocks, make_scratch(model.road))
-        np.testing.assert_array_equal(state, after[i])
 
 
 @pytest.mark.parametrize(
