@@ -22,8 +22,8 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
 
     Traffic flows along a motorway of n mainline segments with on- and off-ramps, S segments in all.
     A step is one second, or ``query_every`` seconds with queries in the first. A policy picks a few
-    mainline segments; the connected vehicles there are queried, and a private release model answers
-    for them and for the F fixed sensors with noisy numbers. An estimator, a recurrent network or a
+    mainline segments, whose connected vehicles are queried. A private release model answers for
+    them and for the F fixed sensors with noisy numbers. An estimator, a recurrent network or a
     Kalman filter on a macroscopic traffic model, updates its estimate of density and speed on all
     segments. The aim is to keep the error of that estimate small with few queries. Queries never
     change the traffic: an episode replays a record of SUMO, made once for each traffic seed and
@@ -171,7 +171,7 @@ class SensorQueryEnv(QueryEnvBase, gym.Env[Observation, Any]):
     | `LongHighway-v0`    | 120 | 128 | 1200 s | paced, 5         | recurrent | 2         | random |
     | `ShortHighway-v0`   | 6   | 8   | 240 s  | printed, 1       | recurrent | 1         | fixed  |
 
-    ``PaperHighway-v0`` is the paper's: its filter, parameters and noise; its schedule is
+    ``PaperHighway-v0`` has the paper's filter, parameters and noise. The paper's schedule is
     ``shift-ahead``. The others are to learn on: they have the best estimator, calibrated
     parameters, and so few queries that it pays to choose them.
 
