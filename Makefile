@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+READY_TO_TRAIN := $(VENV)/.ready-to-train
 
 export OMP_NUM_THREADS = 1
 
@@ -13,15 +14,21 @@ help:  ## Show this list.
 
 setup: $(READY)  ## Make the virtual environment with pinned packages.
 
-$(READY): pyproject.toml constraints.txt
+$(READY_TO_TRAIN): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make setup PYTHON=python3.11; this is " + sys.version)'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	# torch first and pinned: a looser request may bring gigabytes of GPU libraries.
+	@echo "Installing packages of 2 GB, some minutes."
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[train]'
+	touch $@
+
+$(READY): $(READY_TO_TRAIN)
+	@echo "Installing what the tests need, another 1.2 GB."
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-demo: setup  ## Train a query policy for two minutes and compare it with rules on other traffic; results/demo.
+demo: $(READY_TO_TRAIN)  ## Train a query policy for two minutes and compare it with rules on other traffic; results/demo.
 	$(BIN)/python examples/demo.py
 
 pictures: setup  ## Draw the pictures of the pages anew; docs/images.

@@ -2,7 +2,8 @@
 
 dptse study paper --report
 
-It plays what the rows in its folder lack, and writes tables and figures of all.
+It writes tables and figures of the rows in the study's folder. Without --report it first plays what
+they lack.
 """
 
 from __future__ import annotations

@@ -113,15 +113,19 @@ def main(args: Args) -> None:
 def result(folder: Path) -> dict[str, Any]:
     """Return the best policy of a training, its error in validation, and the best rule's."""
     rule, other = best_rule(read_json(folder / RULES_FILE))
-    own = min(map(least, read_progress(folder)))
-    return {"policy": str(folder / BEST), "error": own, "best_rule": rule, "rule_error": other}
+    errors = [least(row) for row in read_progress(folder)]
+    return {
+        "policy": str(folder / BEST), "error": min(errors), "validations": len(errors),
+        "best_rule": rule, "rule_error": other,
+    }  # fmt: skip
 
 
-def in_words(policy: str, error: float, best_rule: str, rule_error: float) -> str:
+def in_words(policy: str, error: float, validations: int, best_rule: str, rule_error: float) -> str:
     """Return a `result` as a line of text."""
     share = 100.0 * (1.0 - error / rule_error)
     side = "below" if share >= 0 else "above"
     return (
-        f"{policy}: error x 1000 in validation {1000 * error:.1f}, {abs(share):.1f} % {side} the "
-        f"best rule, {best_rule} ({1000 * rule_error:.1f}), without the first {WARM_UP} s"
+        f"{policy}: error x 1000 {1000 * error:.1f}, the least of {validations} validations, "
+        f"{abs(share):.1f} % {side} the best rule there, {best_rule} ({1000 * rule_error:.1f}), "
+        f"without the first {WARM_UP} s"
     )

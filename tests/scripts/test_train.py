@@ -33,13 +33,15 @@ def test_it_trains_and_goes_on(tmp_path):
     assert done.returncode == 0, done.stderr
     line, next_step = done.stdout.splitlines()
     said = re.fullmatch(
-        r"(.*): error x 1000 in validation (?P<error>[\d.]+), (?P<share>[\d.]+) % (?P<side>\w+) "
-        r"the best rule, (?P<rule>[a-z-]+) \((?P<other>[\d.]+)\), without the first 60 s",
+        r"(.*): error x 1000 (?P<error>[\d.]+), the least of (?P<n>\d+) validations, "
+        r"(?P<share>[\d.]+) % (?P<side>\w+) the best rule there, (?P<rule>[a-z-]+) "
+        r"\((?P<other>[\d.]+)\), without the first 60 s",
         line,
     )
     best = str(tmp_path / "one" / "best.safetensors")
     assert said[1] == best
     rules = json.loads((tmp_path / "one" / "rules.json").read_text())
+    assert int(said["n"]) == len(read_progress(tmp_path / "one"))
     rule, error, other = said["rule"], float(said["error"]), float(said["other"])
     assert rule == min(rules, key=rules.get)
     assert other == pytest.approx(1000 * rules[rule], abs=0.06)
