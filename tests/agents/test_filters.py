@@ -342,21 +342,6 @@ def test_a_batch_mixes_scenarios_of_any_roads():
         np.testing.assert_allclose(together, np.concatenate([one, two]), atol=1e-5)
 
 
-def test_batches_are_drawn_from_all_scenarios():
-    collected = [collect(mixed("printed"), WALK, None), collect(mixed("corrected"), WALK, None)]
-    starts = {float(each.truth[:, k].sum()): 0 for each in collected for k in range(2)}
-    rng, n_drawn, size = np.random.default_rng(0), 0, len(collected[0].cells.fixed)
-    for _ in range(30):
-        batch = draw_batch(rng, collected, 3)
-        assert batch.roads.n_episodes == 3
-        for first in range(0, 3 * size, size):
-            total = float(batch.truth[:, first : first + size].sum())
-            starts[min(starts, key=lambda known: abs(known - total))] += 1
-            n_drawn += 1
-    assert n_drawn == 90
-    assert min(starts.values()) > 0
-
-
 def test_the_loss_is_the_environments_error():
     """The mean over episodes, however many cells they have."""
     collected = collect(mixed("paced"), WALK, None)

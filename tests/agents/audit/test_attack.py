@@ -12,7 +12,7 @@ from agents.audit.statistics import Claim, audit
 from agents.audit.worlds import Trajectory, Worlds
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import ROUNDING, epsilon_of
-from dptse_env.release import Capped, CappedSettings, ReleaseModel
+from dptse_env.release import Capped, ReleaseModel
 from dptse_env.release.noise import grid_of
 from tests.agents.elsewhere import elsewhere
 
@@ -187,14 +187,6 @@ def test_noise_times_0709_is_rejected_after_five_thousand_runs(setting, record):
     worlds = Planner(setting).choose(record, "worst-case")
     assert verdict(setting, worlds, 5000) == "not rejected"
     assert verdict(setting, worlds, 5000, noise_factor=0.709) == "rejected"
-
-
-def test_a_cap_that_is_not_held_is_rejected(record, monkeypatch):
-    setting = config(epsilon=5.0, cap=6)
-    worlds = Planner(setting).choose(record, "worst-case")
-    assert verdict(setting, worlds) == "not rejected"
-    monkeypatch.setattr(CappedSettings, "contribution_cap", None)
-    assert verdict(setting, worlds) == "rejected"
 
 
 class AskedTooOften(Capped):

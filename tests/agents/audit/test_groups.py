@@ -8,7 +8,7 @@ import pytest
 from agents.audit.planner import Planner
 from agents.audit.worlds import AuditedPenetration, Trajectory, Worlds, audited
 from dptse_env.config import resolve
-from dptse_env.parts import make_task, privacy_report
+from dptse_env.parts import privacy_report
 from dptse_env.release import Capped
 from dptse_env.traffic import Penetration, RecordLibrary
 
@@ -37,28 +37,19 @@ def record():
     return RecordLibrary().get(config().corridor, 0)
 
 
-def standing(record, segment=SENSOR):
-    seconds = np.arange(1, HORIZON + 1)
-    there = Trajectory.constant(seconds, segment, 0.0)
+def standing(record):
+    there = Trajectory.constant(np.arange(1, HORIZON + 1), SENSOR, 0.0)
     return Worlds.adjacent(record, (there, Trajectory.absent()))
 
 
-def reached(setting, worlds, segment=SENSOR, *, queried=True):
+def reached(setting, worlds):
     plan = np.zeros((HORIZON, 6), dtype=bool)
-    plan[:, segment] = queried
+    plan[:, SENSOR] = True
     return small.reached(setting, worlds, plan)
 
 
 def test_a_vehicle_that_both_see_is_as_visible_as_the_account_says(record):
     assert reached(config(), standing(record)) == pytest.approx(1.0, rel=1e-9)
-
-
-def test_each_group_alone_has_its_part(record):
-    _, share = make_task(config()).shares
-    alone = reached(config(), standing(record), queried=False)
-    assert alone == pytest.approx(np.sqrt(share), rel=1e-9)
-    queried = reached(config(), standing(record, segment=1), segment=1)
-    assert queried == pytest.approx(np.sqrt(1.0 - share), rel=1e-9)
 
 
 class Generous(Capped):
