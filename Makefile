@@ -70,7 +70,7 @@ test-fresh: setup  ## Run the tests of properties with examples that are drawn a
 fuzz: setup  ## Try random configurations and hostile files, ten minutes.
 	$(BIN)/python -m tests.fuzz
 
-mutants: setup  ## Break lines of the code in a copy, and see a fast test fail; half an hour.
+mutants: setup  ## Break lines of the code in a copy, and see a fast test fail; an hour.
 	$(BIN)/python -m tests.mutants
 
 test-gymnasium: setup  ## Run the tests of environments with the oldest Gymnasium, which RLlib needs.

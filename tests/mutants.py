@@ -5,7 +5,7 @@ others were drawn. ``python -m tests.mutants`` makes all one by one in a copy of
 runs the tests of their module there, and prints which test has caught each; with words only the
 mutants whose name, file or line of the proof has one of them. It ends with status 1 where a mutant
 lives, which is a missing test, where one cannot be made any more, or where tests fail without one.
-It takes half an hour: run it after a change to what ``docs/privacy/proof.md`` names, and draw
+It takes an hour: run it after a change to what ``docs/privacy/proof.md`` names, and draw
 mutants anew of lines that have changed.
 
 ``python -m tests.mutants --draw FILE NUMBER TEST...`` prints the first mutants of a seeded order of
