@@ -50,6 +50,8 @@ from dptse_env.config import MOST_SEEDS, parse_seeds
 from dptse_env.evaluation import WARM_UP
 from dptse_env.policies import DETERMINISTIC
 from dptse_env.schedules import OBSERVATION_SCHEDULES, ORACLES
+from dptse_env.traffic import Recordings
+from dptse_env.traffic.imported import has_vehicles
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import require_output
 from dptse_env.utils.validation import integer, read_json, require, require_name
@@ -196,6 +198,7 @@ def compare(args: Args) -> None:
         name: settings_of(each.env, each.all_keywords) for name, each in of_estimator.items()
     }
     notes = f"{legend(scores)}. Settings {in_force(settings)}"
+    notes += not_published(cells[0].config.corridor.recordings)
     write_tables(args.output, f"# {title}\n\n{notes}.\n\n{table}", rows)
     page = f", {PAGE} (for a browser)" if args.html else ""
     args.answer(
@@ -333,6 +336,13 @@ def legend(scores: Sequence[Score]) -> str:
     if not all(np.isfinite(each.means[name].mean) for each in scores for name in HONESTY):
         chi2 += ", inf of one that once was certain"
     return f"{one if scores[0].means[ERROR].n == 1 else several}. {chi2}"
+
+
+def not_published(recordings: Recordings | None) -> str:
+    """Return a sentence on errors over recorded vehicles; none over drawn ones and fields."""
+    if recordings is None or not has_vehicles(recordings):
+        return ""
+    return ". Not to be published where drivers are real: errors depend on the true traffic"
 
 
 def in_force(settings: Mapping[str, str]) -> str:

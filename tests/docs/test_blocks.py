@@ -38,6 +38,11 @@ def test_blocks_are_of_languages_that_are_tested_here_and_can_be_parsed():
                 check(line)
 
 
+def test_pages_install_from_the_checkout_since_no_index_has_the_name():
+    named = {page.name for page in PAGES if "dptse-env[" in page.read_text(encoding="utf-8")}
+    assert named == {"install.md"}
+
+
 @pytest.mark.parametrize("page", fast_and_slow(sorted(RUN), RUN - {"pictures.md"}))
 def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dptse_env.traffic import Demand, RecordLibrary, read_corridor
+from scripts.evaluate import not_published
 from tests.helpers import ROOT, make_env
 from tests.importers.data import STRAIGHT, driven, plain, stream, write_csv
 from tests.importers.sumo_net.conftest import PATH, motorway
@@ -56,6 +57,7 @@ def test_trajectories_become_a_road_that_the_other_commands_take(road, tmp_path)
     assert re.search(r"\[environment\]\s+bandwidth = 2", new.read_text())
     assert "T_avg" in run_command("record", "--env", on(new), "--train-seeds", "0:4").stdout
     assert "seed" in refused("record", "--env", on(new), "--train-seeds", "0:16")
+    assert "Not to be published" in not_published(read_corridor(new).recordings)
     # A folder of records is never replaced.
     assert "output" in refused("import", *words, "--format", "table", "--columns", *columns)
     assert new.is_file()
@@ -131,6 +133,7 @@ def test_the_page_on_own_data_imports_a_field(tmp_path, monkeypatch):
     assert "training: 1 window(s), traffic seeds 0\n" in printed
     road = read_corridor("ring-road/road.toml")
     assert (road.name, road.geometry.n_mainline) == ("ring-road", 6)
+    assert not_published(road.recordings) == not_published(None) == ""
 
 
 @pytest.mark.parametrize(
