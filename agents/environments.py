@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from dptse_env.config import KEYWORDS, PRESETS, EnvConfig
-from dptse_env.estimators.recurrent import weights_for
+from dptse_env.estimators.recurrent import weights_of
 from dptse_env.evaluation import require_in_step
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import rounded_up
@@ -182,9 +182,7 @@ def settings_of(env: str, keywords: Mapping[str, Any]) -> str:
     if config.settings_name is not None:
         return config.settings_name
     if config.estimator == "recurrent":
-        weights = config.settings().recurrent.weights
-        flows, own = config.releases_flow, config.parameters.is_own
-        saved = weights_for(weights, config.corridor.road, flows=flows, own=own)
+        saved = weights_of(config.settings(), flows=config.releases_flow)
         return f"weights {saved.source}"
     if config.estimator_settings is None:
         return "defaults"

@@ -236,7 +236,9 @@ class EnvConfig:
         Raises:
             ValueError: They are no settings of this estimator.
         """
-        return checked_settings(self.estimator, self.settings_name or self.estimator_settings)
+        given = checked_settings(self.estimator, self.settings_name or self.estimator_settings)
+        estimator: type[Estimator] = ESTIMATORS.find(self.estimator)
+        return estimator.in_force(self.corridor.road, _played(self), given)
 
     def made_for(self) -> Mapping[str, str]:
         """Return settings that were made for other roads, traffic or releases, and for which."""

@@ -219,6 +219,17 @@ class Estimator(ABC):
         """
 
     @classmethod
+    def in_force(cls, road: Road, played: Played, settings: Any) -> Any:
+        """Return settings with a value for each that is left to what is played.
+
+        Args:
+            road: The road.
+            played: What is played on it.
+            settings: The settings.
+        """
+        return settings
+
+    @classmethod
     def inherits(cls, road: Road, played: Played, settings: Any) -> Mapping[str, str]:
         """Return the settings that were made for other roads, traffic or releases, and for which.
 

@@ -67,8 +67,10 @@ DENSITY_UNIT = 40.0
 DENSITY_RANGE = 4.0
 """Largest density that is estimated, in its unit: vehicles that stand, 6.25 m each."""
 SPEED_RANGE, OWN_SPEED_RANGE = 1.1, 1.4
-"""Largest speed that is estimated, in its unit: a limit, or the free-flow speed of a road's own
-parameters, which is a mean over all vehicles."""
+"""Largest speed that is estimated, in its unit: a limit, or a speed of a road's own parameters,
+which is a mean over all vehicles."""
+ORDINARY = 10.0
+"""Density of a lane [veh/km] whose equilibrium speed is the unit of speeds under own parameters."""
 
 N_FIXED = 7
 """Number of the features of a cell that never change."""
@@ -97,9 +99,10 @@ class Cells(NamedTuple):
 def make_cells(model: ARZModel) -> Cells:
     """Return the fixed features of a model's road.
 
-    The unit of speeds is the free-flow speed of the road's own parameters. Where there are none it
-    is the largest speed limit. So a limit that nobody drives at makes no difference to a road that
-    has been calibrated.
+    The unit of speeds is an equilibrium speed of the road's own parameters, at `ORDINARY` traffic.
+    Where there are none it is the largest speed limit. So a limit that nobody drives at makes no
+    difference to a road that has been calibrated. Neither does a free-flow speed that nobody
+    reaches: a search trades it for gamma and the jam density.
     """
     road, S = model.road, model.n_segments
     n_on = road.entries.size - 1
@@ -110,7 +113,8 @@ def make_cells(model: ARZModel) -> Cells:
     marks[road.exits, 3] = 1.0
     lengths, lanes, limits = road.lengths[:S], road.lanes[:S], road.limits[:S]
     own = model.parameters.is_own
-    speed_unit = float(model.arz.free_flow_speed if own else limits.max())
+    ordinary = _equilibrium_speed(model.arz, 0, ORDINARY * road.lanes[0])
+    speed_unit = float(ordinary if own else limits.max())
     speeds = speed_unit * limits / limits.max()
     scales = np.stack([np.log(lengths / 0.1), np.log(speeds / 100.0)], axis=1)
     return Cells(

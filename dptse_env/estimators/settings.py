@@ -107,8 +107,8 @@ class RecurrentSettings(_Checked, path=f"{PATH}.recurrent"):
         weights: Name of weights that ship with the package, or a file. A pair, one for releases of
             flows and one for releases of speeds, goes by the name that they share: ``roads``
             stands for ``roads-flows`` or ``roads-speeds``. None takes ``highway`` or
-            ``long-highway`` on roads like those of the package, which they were trained on, and
-            ``roads`` on any other. Outside of the ranges on their card they are used with a
+            ``long-highway`` on roads like those of the package, with noise that they were trained
+            on, and ``roads`` otherwise. Outside of the ranges on their card they are used with a
             warning that names these, and ``EnvConfig.inherited`` has this setting.
     """
 

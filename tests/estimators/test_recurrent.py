@@ -2,17 +2,18 @@
 
 import dataclasses
 import hashlib
+import warnings
 
 import numpy as np
 import pytest
 
+from dptse_env.config import resolve
 from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent import (
     member_for,
     outside,
     read_weights,
     shipped_weights,
-    weights_for,
     write_weights,
 )
 from dptse_env.estimators.recurrent_kernels import (
@@ -23,7 +24,7 @@ from dptse_env.estimators.recurrent_kernels import (
     make_cells,
 )
 from dptse_env.model import ARZModel, load_parameters
-from dptse_env.traffic import CORRIDORS, PAPER_HIGHWAY
+from dptse_env.traffic import PAPER_HIGHWAY
 from tests.hostile import check_hostile, edited
 
 from .helpers import card, random_weights, run, simulate, started, step, weights_settings
@@ -201,8 +202,10 @@ def test_a_limit_that_nobody_drives_at_makes_no_difference_to_a_calibrated_road(
     own = dataclasses.replace(load_parameters("w99-3lane"), name="own")
     roads = [PAPER_HIGHWAY.replaced(speed_limit=limit).road for limit in (100.0, 150.0)]
     first, other = (make_cells(ARZModel(road, own)) for road in roads)
-    assert first.speed_unit == other.speed_unit == own.free_flow_speed
-    assert first.fastest == other.fastest == pytest.approx(1.4 * own.free_flow_speed)
+    jam = own.jam_density / own.lanes
+    ordinary = own.free_flow_speed * (1.0 - (10.0 / jam) ** own.gamma)
+    assert first.speed_unit == other.speed_unit == pytest.approx(ordinary)
+    assert first.fastest == other.fastest == pytest.approx(1.4 * ordinary)
     np.testing.assert_array_equal(first.fixed, other.fixed)
     shipped = [make_cells(ARZModel(road, load_parameters("w99-3lane"))) for road in roads]
     assert [each.speed_unit for each in shipped] == [100.0, 150.0]
@@ -234,8 +237,8 @@ DIGESTS = {
     "highway-flows": ("a7cd6a7d0da0", "b8053dba8f85"),
     "highway-speeds": ("98c08e7ad753", "5eabe2045192"),
     "long-highway-flows": ("0718f2eebe91", "ce544dbbe3ab"),
-    "roads-flows": ("", "38e7d7411b6a"),
-    "roads-speeds": ("", "67583c07d6a3"),
+    "roads-flows": ("", "b1289751e554"),
+    "roads-speeds": ("", "9a010ec87657"),
 }
 """The first digits of the digests of the files before they were converted, and of their weights."""
 
@@ -279,21 +282,33 @@ def test_a_pair_is_found_by_the_name_it_shares(tmp_path):
         read_weights("nowhere")
 
 
+OWN = dataclasses.asdict(load_parameters("w99-3lane")) | {"name": "mine"}
+LONG, HIGHWAY = {"corridor": "long-highway"}, {"recurrent": {"weights": "highway"}}
+
+
 @pytest.mark.parametrize(
-    ("road", "flows", "weights"),
+    ("played", "weights"),
     [
-        (PAPER_HIGHWAY, True, "highway-flows"),
-        (PAPER_HIGHWAY, False, "highway-speeds"),
-        (CORRIDORS["long-highway"], True, "long-highway-flows"),
-        (CORRIDORS["long-highway"], False, "roads-speeds"),
-        (PAPER_HIGHWAY.replaced(speed_limit=100.0), True, "roads-flows"),
-        (PAPER_HIGHWAY.replaced(speed_limit=30.0), True, "roads-flows"),
+        ({}, "highway"),
+        ({"privacy": "corrected"}, "highway"),
+        ({"penetration": 0.2}, "highway"),
+        (LONG, "long-highway"),
+        (LONG | {"privacy": "corrected"}, "roads"),
+        ({"corridor": {"speed_limit": 100.0}}, "roads"),
+        ({"corridor": {"speed_limit": 30.0}}, "roads"),
+        ({"epsilon": 1000.0}, "roads"),
+        ({"parameters": OWN}, "roads"),
+        (
+            {"epsilon": 1000.0, "estimator_settings": {"recurrent": {"weights": "highway"}}},
+            "highway",
+        ),
     ],
 )
-def test_the_weights_of_the_package_that_know_a_road_are_taken(road, flows, weights):
-    assert weights_for(None, road.road, flows=flows, own=False).source == weights
-    own = "roads-flows" if flows else "roads-speeds"
-    assert weights_for(None, road.road, flows=flows, own=True).source == own
+def test_the_weights_of_the_package_that_know_what_is_played_are_taken(played, weights):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        config = resolve("private-highway", {"estimator": "recurrent", **played})
+    assert config.settings().recurrent.weights == weights
 
 
 def test_damaged_files_are_refused(path, tmp_path):
