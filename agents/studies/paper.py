@@ -54,6 +54,7 @@ from agents.tables import (
     SPEED,
     error_label,
     format_interval,
+    format_range,
     paired,
     pick,
     table,
@@ -419,19 +420,65 @@ def tables_of(rows: pl.DataFrame) -> str:
         text = format_interval(measure(claim.statistic, part, setting))
         return f"{text} {SIGNS[verdict_of(claim, part, setting)]}"
 
+    def excess(pair: tuple[Curve, Curve], setting: str) -> str:
+        above = measure(EXCESS, pair, setting)
+        return f"{above.mean:+.1f} ± {above.half_width:.1f}"
+
+    def above_best(metric: str, group: Sequence[str], name: str, setting: str) -> str:
+        others = [Curve(each, metric) for each in group]
+        best = min(others, key=lambda each: measure(LEVEL, (each,), setting).mean)
+        return "least" if best.estimator == name else excess((Curve(name, metric), best), setting)
+
     names = {LABELS[name]: name for name in ESTIMATORS}
     own = {f"{LABELS[name]}, as published": label for label, name in AS_PUBLISHED.items()}
+    seeds = format_range(sorted(rows["traffic_seed"].unique()))
+    fixed = ", ".join(f"{AXES[key]} = {value:g}" for key, value in BASE.items())
+    where = f"{fixed}, schedule `{SCHEDULE}`, traffic seeds {seeds}"
     text = [
         "# The paper's results",
+        f"Claims and tables of errors are of traffic seeds {seeds}, with the schedule `{SCHEDULE}` "
+        "and 95 % intervals. Estimators of one name have our settings, those *as published* the "
+        "paper's own. A difference in per cent is the mean over episodes of the per cent in each, "
+        "paired by traffic and noise.",
         "## Claims of the paper, and how many of their parts hold",
         by_setting("claim", {claim.statement: claim for claim in CLAIMS}, verdict),
     ]
     for metric, (name, unit) in METRICS.items():
         text += [
             f"## RMSE of {name} [{unit}], and by how much it exceeds the random walk's",
+            f"At {where}.",
             by_setting("estimator", names | own, partial(error, metric)),
         ]
-    text += ["## Time of a step [ms]", by_setting("estimator", names, milliseconds)]
+    for group, whose in ((PAPER_ESTIMATORS, "our"), (tuple(AS_PUBLISHED), "the paper's")):
+        text += [
+            f"## By how much a filter errs more than the best one, with {whose} settings [%]",
+            f"At {where}.",
+            by_setting(
+                "filter",
+                {
+                    f"{LABELS[AS_PUBLISHED.get(name, name)]}: {METRICS[metric][0]}": (metric, name)
+                    for metric in METRICS
+                    for name in group
+                },
+                lambda key, setting, group=group: above_best(key[0], group, key[1], setting),
+            ),
+        ]
+    text += [
+        "## By how much a filter errs more with the paper's settings than with ours [%]",
+        f"At {where}.",
+        by_setting(
+            "filter",
+            {
+                f"{LABELS[name]}: {METRICS[metric][0]}": (Curve(label, metric), Curve(name, metric))
+                for metric in METRICS
+                for label, name in AS_PUBLISHED.items()
+            },
+            excess,
+        ),
+        "## Time of a step [ms]",
+        "One episode at a time. All but the open loop are compiled.",
+        by_setting("estimator", names, milliseconds),
+    ]
     text.append("## Each claim in numbers: ✓ holds, ✗ does not hold, ? undecided")
     for claim in CLAIMS:
         text += [
