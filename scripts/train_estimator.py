@@ -5,16 +5,17 @@ dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --seed 0 --rounds ow
     --plan '{"ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}'
 
 Each kind and seed is a training in a folder of its own, with progress.csv (the learning curve),
-plan.json (the settings) and checkpoint.pt. The best weights of each kind on validation traffic
-become weights-flows.safetensors and weights-speeds.safetensors in the output folder, a pair that
-the environment takes with the keywords that the command prints. The same command goes on.
+plan.json (the settings) and checkpoint.pt. Where the trainings of a kind begin with the same
+weights, the mean of their ends is taken as one more. The best weights of each kind on validation
+traffic become weights-flows.safetensors and weights-speeds.safetensors in the output folder, a pair
+that the environment takes with the keywords that the command prints. The same command goes on.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ from agents.filters.highways import Kind as HighwayKind
 from agents.filters.highways import draw_highway
 from agents.filters.plan import FilterPlan, Round, played_by
 from agents.filters.scenarios import Kind, ScenarioRanges
-from agents.filters.training import WEIGHTS, FilterTraining
+from agents.filters.training import WEIGHTS, FilterTraining, write_mean
 from agents.play import record
 from agents.terminal import make_table
 from agents.training.run_files import Row
@@ -39,9 +40,9 @@ from dptse_env.utils.files import replacing, require_output
 from dptse_env.utils.validation import from_mapping, parse_json, require, within
 from scripts.cli import Command, Environments, Machines, Output, TrainSeeds, ValidationSeeds
 
-NAME = "weights"
-"""Name of the pair of weights in the output folder."""
-CONTINUED: dict[str, Any] = {"learning_rate": 1.5e-3, "teacher": 0.5, "checkpoint_every": 160}
+NAME, MEAN = "weights", "mean"
+"""Names of the pair of weights in the output folder, and of the mean in place of a seed."""
+CONTINUED: dict[str, Any] = {"learning_rate": 1e-3, "teacher": 0.5, "checkpoint_every": 160}
 """Fields of a plan that begins with trained weights."""
 TEACHER = "highway"
 """Pair of weights that teaches where `roads` are the initial ones."""
@@ -58,14 +59,15 @@ class Args(Output, Machines, ValidationSeeds, TrainSeeds, Environments, Command)
     random highways; nine roads if not given."""
     validation_env: tuple[str, ...] = ()
     """Environments to validate in, with a round robin, beside sections of other highways."""
-    rounds: tuple[str, ...] = ("own:96:80",) * 12
+    rounds: tuple[str, ...] = ("own:96:80",) * 4
     """Rounds as estimator:scenarios:passes; 'own' is the network that is trained."""
     initial: str | None = "roads"
     """Pair of weights to begin with, which also teaches; None for random ones."""
     plan: str = "{}"
     """Further fields of the plan (agents/filters/plan.py) as JSON."""
-    seed: str = "0:3"
-    """Training seeds, first:stop; the best weights on validation traffic are taken."""
+    seed: str = "0:4"
+    """Training seeds, first:stop; of their weights and the mean the best on validation traffic are
+    taken."""
     train_seeds: str = "0:32"
     validation_seeds: str = "1000:1008"
     output: Path = Path("results/weights")
@@ -149,12 +151,16 @@ def main(args: Args) -> None:
         folder.name: {name: row[name] for name in columns if name in row}
         for (_, folder), row in zip(tasks, last, strict=True)
     }
+    for kind, plan in plans.items():
+        if plan.initial is not None and len(seeds) > 1:
+            folders = [args.output / f"{kind}-{seed}" for seed in seeds]
+            trainings[f"{kind}-{MEAN}"] = average(plan, folders, args.records)
     table = make_table("on validation traffic", "training", "error x 1000", "on sections", "chi2")
     for training, row in trainings.items():
         errors = [f"{1000 * row[name]:.1f}" if name in row else "" for name in columns[:2]]
         table.add_row(training, *errors, f"{row['chi2']:.2f}")
     for kind in plans:
-        names = [f"{kind}-{seed}" for seed in seeds]
+        names = [name for name in trainings if name.startswith(f"{kind}-")]
         best = min(names, key=lambda name: trainings[name]["validation"])
         with replacing(args.output / f"{NAME}-{kind}.safetensors") as temporary:
             shutil.copyfile(args.output / best / WEIGHTS, temporary)
@@ -172,6 +178,14 @@ def train(task: Task, records: Path | None, executor: Executor = this_process) -
     training = FilterTraining(plan, folder, records=records, executor=executor)
     training.run()
     return training.rows[-1]
+
+
+def average(plan: FilterPlan, folders: Sequence[Path], records: Path | None) -> Row:
+    """Write the mean of trainings to a folder beside theirs, and return its validation."""
+    folder = folders[0].with_name(f"{plan.kind}-{MEAN}")
+    folder.mkdir(exist_ok=True)
+    write_mean(folder / WEIGHTS, folders)
+    return FilterTraining(plan, folders[0], records=records).validate(folder / WEIGHTS)
 
 
 def record_all(args: Args, plans: Iterable[FilterPlan], executor: Executor) -> None:

@@ -9,12 +9,14 @@ pytest.importorskip("torch")
 pytest.importorskip("tyro")
 
 import gymnasium as gym
+import numpy as np
 import tyro
 
 from agents.training.run_files import read_progress
-from dptse_env.estimators.recurrent import read_weights
+from dptse_env.estimators.recurrent import read_weights, write_weights
 from scripts import train_estimator
 from scripts.train_estimator import Args, make_plan
+from tests.estimators.helpers import card, random_weights
 from tests.helpers import SHORT
 
 PLAN = {
@@ -58,6 +60,25 @@ def test_it_trains_a_pair_that_an_environment_takes(tmp_path, capsys):
         gym.make(SHORT, privacy=privacy, **keywords).reset(seed=0)
     with pytest.raises(ValueError, match="width is 4 there and 8 now"):
         train_estimator.main(arguments(tmp_path, "--plan", json.dumps({**PLAN, "width": 8})))
+
+
+@pytest.mark.slow
+def test_the_mean_of_trainings_that_begin_alike_is_one_more(tmp_path, capsys):
+    initial = tmp_path / "initial.safetensors"
+    write_weights(initial, random_weights(4), card())
+    more = ("--kinds", "flows", "--initial", str(initial), "--rounds", "own:1:1", "--json")
+    train_estimator.main(arguments(tmp_path / "out", *more))
+    trainings = json.loads(capsys.readouterr().out)["trainings"]
+    assert list(trainings) == ["flows-0", "flows-1", "flows-mean"]
+    ends = [
+        read_weights(str(tmp_path / "out" / name / "weights.safetensors")) for name in trainings
+    ]
+    for first, second, mean in zip(*(each.weights for each in ends), strict=True):
+        np.testing.assert_allclose(mean, 0.5 * (first + second), rtol=1e-6)
+    assert ends[2].card["mean_of"] == ["flows-0", "flows-1"]
+    best = min(trainings, key=lambda name: trainings[name]["validation"])
+    taken = read_weights(str(tmp_path / "out" / "weights-flows.safetensors"))
+    assert taken.card["name"] == best
 
 
 def test_an_episode_is_no_longer_than_the_records_of_the_roads(tmp_path):
