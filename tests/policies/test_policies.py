@@ -12,6 +12,7 @@ from tests.hostile import check_hostile, edited
 
 SHIPPED = Path(dptse_env.policies.__file__).parent / "short-highway.safetensors"
 DIGESTS = {
+    "paper-highway-capped": "fe8151e90ada",
     "short-highway": "d89a8c5a48dc",
     "short-highway-capped": "b93572eb2357",
     "short-highway-corrected": "9c8693821d23",
@@ -61,7 +62,7 @@ def test_a_card_imports_no_code(tmp_path):
 
 
 def test_files_that_are_not_there_or_of_models(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"'absent': .*come with the package \(short-"):
+    with pytest.raises(FileNotFoundError, match=r"'absent': .*come with the package \(paper-"):
         read_policy("absent")
     (tmp_path / "model.zip").write_bytes(b"PK\x03\x04")
     with pytest.raises(ValueError, match=r"model\.zip is no saved policy; dptse import policy"):
