@@ -7,6 +7,7 @@ changes. So no estimator is proposed that loses to another one under the propose
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,6 +21,8 @@ from agents.statistics import mean_interval
 from agents.study import Place, Study, play_study
 from agents.tables import ERROR, Labels, give_or_take, values
 from dptse_env.utils.arrays import FloatArray
+
+told = logging.getLogger("dptse")
 
 NAME = "fit"
 FILTER, ROUND_ROBIN = "ekf", "round-robin"
@@ -202,6 +205,7 @@ class Choice:
         Raises:
             ValueError: The environment refuses all of them.
         """
+        told.info("play %d options of the %s on validation traffic", len(options), what)
         played = self.play([self.labels("validation", **changes) for changes in options])
         if not played:
             raise ValueError(f"{self.road.path}: {self.notes[-1]}")

@@ -274,7 +274,7 @@ def _say_recording(corridor: Corridor, n_seeds: int) -> None:
         _said.add(corridor.digest)
     logger.log(
         logging.INFO if is_said else logging.WARNING,
-        "Recording traffic of %s with SUMO, once for each traffic seed: about %.0f s",
+        "Recording traffic of %s with SUMO, once for each traffic seed: %.0f s or more",
         corridor.name,
         seconds,
     )

@@ -59,6 +59,7 @@ def fitted(tmp_path_factory):
     path.write_text(ROAD)
     done = run_command("fit", path, *BRIEF, "--json")
     assert done.returncode == 0, done.stderr
+    assert "\nplay 2 options of the policy on validation traffic\n" in done.stderr
     return path, json.loads(done.stdout)
 
 
