@@ -380,7 +380,8 @@ def read_road_of(text, path):
 def test_a_choice_is_written_whatever_the_file_looks_like(text, tmp_path):
     path = tmp_path / "road.toml"
     path.write_bytes(text.encode())
-    chosen = {"parameters": "fit/a.json", "estimator": "ekf"}
+    fusion = {"speed_spread": 9.0, "dwell_factor": 0.0}
+    chosen = {"fusion": fusion, "parameters": "fit/a.json", "estimator": "ekf"}
     link = tmp_path / "link.toml"
     link.symlink_to(path)
     assert write_choice(link, chosen, 9.8, of_records=True)
@@ -388,7 +389,7 @@ def test_a_choice_is_written_whatever_the_file_looks_like(text, tmp_path):
     assert copy_of(path).read_bytes() == text.encode()
     new, old = tomllib.loads(path.read_bytes().decode()), tomllib.loads(text)
     assert new.pop("average_dwell") == 9.8
-    assert new.pop("measured") == ["average_dwell", "parameters", "estimator"]
+    assert new.pop("measured") == ["average_dwell", *chosen]
     table = old.pop("environment", {})
     table.pop("estimator_settings", None)
     assert new.pop("environment") == {**table, **chosen}
@@ -398,7 +399,7 @@ def test_a_choice_is_written_whatever_the_file_looks_like(text, tmp_path):
     ukf = {"estimator": "ukf", "estimator_settings": "x.json"}
     assert write_choice(path, ukf, None, of_records=True)
     measured = tomllib.loads(path.read_bytes().decode())["measured"]
-    assert measured == ["average_dwell", "parameters", "estimator", "estimator_settings"]
+    assert measured == ["average_dwell", *chosen, "estimator_settings"]
 
 
 NO_DEMAND = ROAD.replace("2400", "0")
