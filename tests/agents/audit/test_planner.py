@@ -11,7 +11,7 @@ from dptse_env.parts import privacy_report
 from dptse_env.release import Paced
 from tests.helpers import fast_and_slow
 
-from .small import HORIZON, ROAD, SECONDS, HalfTheLimit, config, paced, reached, staying
+from .small import HORIZON, ROAD, HalfTheLimit, config, paced, reached, staying
 
 # --- what a vehicle tells -------------------------------------------------------------------------
 
@@ -168,28 +168,6 @@ def test_the_hunter_queries_the_seconds_that_reveal_most(record):
     later = free.step[free.step > best.max()]
     assert set(np.flatnonzero(plan.any(axis=1)) + 1) == {*best.tolist(), *later.tolist()}
     assert plan.sum() == 3 + later.size > 3
-
-
-@pytest.mark.parametrize("bandwidth", [1, 2, 5])
-def test_the_hunter_of_ledgers_follows_both_vehicles_every_second(bandwidth, record):
-    setting = paced(bandwidth=bandwidth)
-    places = SECONDS // 7 % 5, (SECONDS // 5 + 2) % 5
-    paths = tuple(Trajectory(SECONDS, place, np.full(HORIZON, 30.0)) for place in places)
-    plan = Planner(setting).plan(Worlds.adjacent(record, paths))
-    followed = np.stack([plan[np.arange(HORIZON), place] for place in places])
-    if bandwidth == 1:
-        assert (followed[0] | followed[1]).all()
-        assert followed[0][::2].all()
-        assert followed[1][1::2].all()
-    else:
-        assert followed.all()
-    # What is left goes round; nothing is needed where a sensor stands.
-    assert (plan.sum(axis=1) == bandwidth).all()
-    assert bandwidth < 5 or (plan.sum(axis=0) > 0).all()
-    sensor = Worlds.adjacent(record, (staying(ROAD.fixed_sensors[0]), Trajectory.absent()))
-    np.testing.assert_array_equal(
-        Planner(setting).plan(sensor), public_plan(setting, "round-robin")
-    )
 
 
 def test_contributions_are_spent_where_they_tell_most():
