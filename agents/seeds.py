@@ -19,8 +19,6 @@ CHOICE = range(2_000_000, 3_000_000)
 query suite, on validation traffic."""
 TRAINING_VALIDATION = range(4_000_000, 5_000_000)
 """The learning curve of a training, by which its best policy is kept, and the rules beside it."""
-STUDY_TEST = range(6_000_000, 7_000_000)
-"""The test results of the study of policies."""
 SUITE = range(7_000_000, 8_000_000)
 """The tasks of the query suite."""
 TRAINING = range(10_000_000, 1_010_000_000)
