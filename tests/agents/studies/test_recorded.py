@@ -43,4 +43,4 @@ def test_tables_and_figures_are_those_of_the_rows(name, tmp_path):
     assert tables == (RESULTS / name / "tables.md").read_text(encoding="utf-8")
     drawn = {path.name: path.stat().st_size for path in tmp_path.glob("*.png")}
     assert drawn.keys() == {path.name for path in (RESULTS / name).glob("*.png")}
-    assert max(drawn.values()) < 200_000
+    assert max(drawn.values()) < 300_000
