@@ -5,10 +5,9 @@ dptse train-estimator --env dptse_env:dptse/ShortHighway-v0 --seed 0 --rounds ow
     --plan '{"ranges": {"highways": [0, 2]}, "validation_highways": [1000, 1001]}'
 
 Each kind and seed is a training in a folder of its own, with progress.csv (the learning curve),
-plan.json (the settings) and checkpoint.pt. Where the trainings of a kind begin with the same
-weights, the mean of their ends is taken as one more. The best weights of each kind on validation
-traffic become weights-flows.safetensors and weights-speeds.safetensors in the output folder, a pair
-that the environment takes with the keywords that the command prints. The same command goes on.
+plan.json (the settings) and checkpoint.pt. Where several begin with the same weights, the mean of
+their ends is one more. The best weights on validation traffic become weights-flows.safetensors and
+weights-speeds.safetensors, a pair that the printed keywords take. The same command goes on.
 """
 
 from __future__ import annotations
@@ -66,8 +65,7 @@ class Args(Output, Machines, ValidationSeeds, TrainSeeds, Environments, Command)
     plan: str = "{}"
     """Further fields of the plan (agents/filters/plan.py) as JSON."""
     seed: str = "0:4"
-    """Training seeds, first:stop; of their weights and the mean the best on validation traffic are
-    taken."""
+    """Training seeds, first:stop."""
     train_seeds: str = "0:32"
     validation_seeds: str = "1000:1008"
     output: Path = Path("results/weights")
