@@ -3,11 +3,11 @@ r"""Compare query policies and estimators on the same traffic and noise.
 dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --test-seeds 2000:2004 \
     --policies shift-ahead round-robin
 
-Errors leave out the first 60 s of an episode. Differences are paired by traffic and noise.
+Errors leave out the first 60 s. Differences are paired by traffic and noise.
 
 dptse evaluate --suite short-printed --policies speed-front
 
-An entry to the query suite gets a card. Several policies are training seeds; TOML names tasks.
+An entry gets a card. Several policies are training seeds; TOML names tasks.
 """
 
 from __future__ import annotations
@@ -91,8 +91,7 @@ class Args(
     seed: int = 0
     """Seeds noise and estimators, one stream for each traffic seed."""
     reference: str | None = None
-    """Policy that the others are compared with; round-robin, but none beside a single policy of
-    several estimators."""
+    """Policy to compare with: round-robin, if not one with several estimators."""
     acts: Literal["deterministic", "drawn"] | None = None
     """Take likeliest actions, or draw them; else as policies say."""
     transfer: bool = False
