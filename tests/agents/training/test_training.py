@@ -364,9 +364,7 @@ def test_rules_are_played_once_for_each_environment(tmp_path, monkeypatch):
 # --- non-interference; see `tests.test_non_interference` ------------------------------------------
 
 
-@pytest.fixture(
-    scope="module", params=fast_and_slow(ALGORITHMS, ["plackett-luce", "recurrent-ppo"])
-)
+@pytest.fixture(scope="module", params=fast_and_slow(ALGORITHMS, ["recurrent-ppo"]))
 def private(request, tmp_path_factory):
     """A policy of every algorithm, trained a little with the truth at hand."""
     keywords = {"horizon": 70, "privacy": "capped", "bandwidth": 1 if "dqn" in request.param else 2}
