@@ -3,11 +3,10 @@ r"""Compare query policies and estimators on the same traffic and noise.
 dptse evaluate --env dptse_env:dptse/ShortHighway-v0 --test-seeds 2000:2004 \
     --policies shift-ahead round-robin
 
-Errors leave out the first 60 s. Differences are paired by traffic and noise.
-
 dptse evaluate --suite short-printed --policies speed-front
 
-An entry gets a card. Several policies are training seeds; TOML names tasks.
+Errors leave out the first 60 s. Differences are paired by traffic and noise. An entry to the suite
+gets a card. Several policies are training seeds; TOML names tasks.
 """
 
 from __future__ import annotations
