@@ -94,7 +94,7 @@ class Args(
     acts: Literal["deterministic", "drawn"] | None = None
     """Take likeliest actions, or draw them; else as policies say."""
     transfer: bool = False
-    """Let policies act where they were not trained."""
+    """Let policies act where untrained."""
     html: bool = False
     """Also write an interactive page, page.html."""
     suite: tuple[str, ...] | None = None
