@@ -90,11 +90,11 @@ class Args(
     seed: int = 0
     """Seeds noise and estimators, one stream for each traffic seed."""
     reference: str | None = None
-    """Policy to compare with: round-robin, if not one with several estimators."""
+    """Policy to compare with; round-robin beside other policies."""
     acts: Literal["deterministic", "drawn"] | None = None
     """Take likeliest actions, or draw them; else as policies say."""
     transfer: bool = False
-    """Let policies act where untrained."""
+    """Let policies act where they were not trained."""
     html: bool = False
     """Also write an interactive page, page.html."""
     suite: tuple[str, ...] | None = None
