@@ -168,10 +168,11 @@ def fit_parameters(
             if is_stable(parameters, corridor):
                 tried[key] = filter_error(cell, parameters, library)
             write_json(kept, [[*each, error] for each, error in tried.items()])
+            if shown.disable and len(tried) % TOLD == 0:
+                least = min(tried.values())
+                told.info("tried %d of %d, error x 1000 %.1f", len(tried), trials, least)
         shown.update()
         shown.set_postfix_str(f"error {min(tried.values()):.1f}")
-        if shown.disable and len(tried) % TOLD == 0:
-            told.info("tried %d of %d, error x 1000 %.1f", len(tried), trials, min(tried.values()))
         return tried[key]
 
     per_lane = start.jam_density / start.lanes
