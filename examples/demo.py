@@ -38,11 +38,12 @@ def main(
     policy = training / "best.safetensors"
     seeds = "--train-seeds", "0:64", "--validation-seeds", "1000:1016"
     how = "--algorithm", ALGORITHM, "--minutes", minutes
-    print(f"training for {minutes:g} minutes; {training / 'progress.csv'} has each validation")
+    progress = training / "progress.csv"
+    print(f"training for {minutes:g} minutes of processor time; {progress} has each validation")
     run("train", "--env", ENV, *how, *seeds, "--output", training)
     rules = json.loads((training / "rules.json").read_text(encoding="utf-8"))
     rule = min(rules, key=rules.get)
-    print(f"playing traffic {test_seeds}, a minute")
+    print(f"playing traffic {test_seeds}, a minute on quiet cores")
     found = run(
         "evaluate", "--env", ENV, "--policies", policy, "round-robin", rule, "all",
         "--reference", rule, "--test-seeds", test_seeds, "--output", output, "--force", "--json",

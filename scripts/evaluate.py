@@ -392,7 +392,8 @@ def estimator_verdicts(rows: pl.DataFrame, scores: Sequence[Score]) -> list[str]
             gain = below(rows, least | {"estimator": each.estimator}, least)
             more.append(f"{each.estimator} {-gain.mean:.1f} ± {gain.half_width:.1f} %")
         lines.append(
-            f"{policy}: {best.estimator} errs least ({best.error:.1f}); more by {', '.join(more)}"
+            f"{policy}: {best.estimator} has the least error x 1000 ({best.error:.1f}); more by "
+            f"{', '.join(more)}"
         )
     return lines
 

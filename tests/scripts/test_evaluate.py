@@ -179,7 +179,7 @@ def test_estimators_of_a_single_policy_are_compared_with_the_best_one(tmp_path):
     for name in others:
         more = mean_interval(100.0 * (errors[name] - errors[best]) / least)
         told.append(f"{name} {more.mean:.1f} ± {more.half_width:.1f} %")
-    line = f"none: {best} errs least ({least:.1f}); more by {', '.join(told)}\n"
+    line = f"none: {best} has the least error x 1000 ({least:.1f}); more by {', '.join(told)}\n"
     assert line in done.stdout
     assert done.stdout.count("against") == 3
     assert "(estimates and queries, none, traffic seed 2000)" in done.stdout
