@@ -225,7 +225,7 @@ def failed(copy: Path, tests: list[str], **environment: str) -> str:
     )  # fmt: skip
     if ended.returncode == 0:
         return ""
-    found = re.search(r"^FAILED tests/(.+?) - (.*)$", ended.stdout, re.MULTILINE)
+    found = re.search(r"^(?:FAILED|ERROR) tests/(.+?) - (.*)$", ended.stdout, re.MULTILINE)
     if ended.returncode != 1 or found is None or UNSOUND.match(found[2]):
         raise RuntimeError(f"pytest ended with {ended.returncode}:\n{ended.stdout}{ended.stderr}")
     return found[1]
