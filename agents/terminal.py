@@ -1,13 +1,17 @@
-"""Tables for a terminal or a pipe, in which no number is ever cut."""
+"""Tables for a terminal or a pipe, in which no number is ever cut, and lines for a file."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 
 from rich import box
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
+
+told = logging.getLogger("dptse")
+"""Tells files, which have no bars, how far long work is."""
 
 _UNLIMITED = 100_000
 

@@ -28,7 +28,7 @@ from agents.environments import parse_env, preset_of, quietly
 from agents.executors import Executor, ExecutorError, ExecutorName, make_executor
 from agents.play import PlayError, record
 from agents.study import Place
-from agents.terminal import print_table
+from agents.terminal import print_table, told
 from dptse_env.config import resolve
 from dptse_env.traffic import (
     Corridor,
@@ -42,8 +42,6 @@ from dptse_env.utils.files import require_writable
 from dptse_env.utils.registry import MissingExtraError
 from dptse_env.utils.threads import n_cores
 from dptse_env.utils.validation import integer, require
-
-told = logging.getLogger("dptse")
 
 ROUND = 4
 """Records of each process after which a file is told of them."""

@@ -7,7 +7,6 @@ changes. So no estimator is proposed that loses to another one under the propose
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,9 +19,8 @@ from agents.seeds import CHOICE, EVALUATION, TUNING
 from agents.statistics import mean_interval
 from agents.study import Place, Study, play_study
 from agents.tables import ERROR, Labels, give_or_take, values
+from agents.terminal import told
 from dptse_env.utils.arrays import FloatArray
-
-told = logging.getLogger("dptse")
 
 NAME = "fit"
 FILTER, ROUND_ROBIN = "ekf", "round-robin"

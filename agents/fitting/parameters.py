@@ -9,7 +9,6 @@ a shipped set, and the filter has the tuned settings of that set, which the fitt
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from scipy import optimize
 
 from agents.files import write_json
 from agents.play import Cell, play
+from agents.terminal import told
 from dptse_env.config import TIME_STEP
 from dptse_env.model import ARZModel, ARZParameters
 from dptse_env.release import Traffic
@@ -29,8 +29,6 @@ from dptse_env.utils.validation import read_json
 
 FIELDS = ("free_flow_speed", "jam_density", "gamma", "relaxation_time")
 """Parameters that are searched, the jam density for one lane."""
-
-told = logging.getLogger("dptse")
 
 TOLD = 20
 """Trials after which a file, which has no bar, is told of them."""

@@ -74,7 +74,7 @@ class Road:
 
     @property
     def is_of_records(self) -> bool:
-        """Whether files have its vehicles; else they are drawn, and are nobody's."""
+        """True where files have its vehicles; those that are drawn are nobody's."""
         return self.corridor.recordings is not None or self.corridor.sumo is not None
 
     @property

@@ -43,7 +43,7 @@ FORMAT = "recurrent-3"
 SHIPPED = ("highway", "long-highway", "roads")
 """Pairs that come with the package, each trained on more kinds of roads than those before it."""
 CHOSEN_BY = ("flows", "own_parameters", "epsilon")
-"""What weights must know beside the road, to be taken on it.
+"""Properties that weights must know beside the road, to be taken on it.
 
 At epsilon 1,000, ``roads`` errs 21.3 +- 3.3 % less than ``highway`` on PrivateHighway-v1. With one
 connected vehicle in five it errs 36 +- 14 % more on ShortHighway-v0, though ``highway`` knows no
