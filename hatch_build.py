@@ -38,7 +38,7 @@ def for_package_page(text: str, repository: str | None, tag: str) -> str:
         if repository is None:
             return "" if picture else words
         if picture:
-            target = re.sub(r"\.gif$", ".png", target)  # the still beside a moving picture
+            target = re.sub(r"\.webp$", ".png", target)  # the still beside a moving picture
         kind = "raw" if picture else "blob"
         return f"{picture}[{words}]({repository.rstrip('/')}/{kind}/{tag}/{target})"
 

@@ -12,8 +12,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, NullLocator
 from numpy.typing import ArrayLike, NDArray
 
@@ -23,11 +26,14 @@ from dptse_env.rendering import DENSITY_MAP, History
 from dptse_env.utils.arrays import FloatArray
 from dptse_env.utils.files import replacing
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666")
-"""Okabe and Ito's, which the colour-blind can tell apart, and a grey."""
+INK = "#757a82"
+"""A grey that is read on white and on dark pages: figures are transparent."""
+COLOURS = ("#1a80c4", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", INK)
+"""Okabe and Ito's, which the colour-blind can tell apart, with a lighter blue, and the grey."""
+SHADES = LinearSegmentedColormap.from_list("shades", [(INK, 0.0), (INK, 1.0)])
+"""From nothing to the grey."""
 WIDTH = 4.6
 """Largest width of a figure [inches]: its texts of 8 points are read on a phone."""
-INK, GREY, GRID_COLOUR = "#1b2a41", "#333333", "#e3e6ea"
 ERROR_TICKS = (1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 700, 1000)
 
 
@@ -42,12 +48,28 @@ def make_figure(width: float, height: float, dpi: int = 160) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path, title: str) -> None:
-    """Give a figure its title and save it as PNG, without pyplot and its global state."""
+    """Give a figure its title and save it as PNG, without pyplot and its global state.
+
+    The PNG is transparent, and what is black turns grey.
+    """
     folded = fill(title, int(13 * figure.get_figwidth()))
     figure.suptitle(folded, x=0.01, ha="left", fontsize=10)
+    turn_grey(figure)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png")
+        figure.savefig(temporary, format="png", transparent=True)
+
+
+def turn_grey(figure: Figure) -> None:
+    """Give black texts and lines the colour that is read on dark pages, too."""
+    figure.draw_without_rendering()  # makes the ticks
+    drawn: Any = figure.findobj(lambda each: isinstance(each, Text | Line2D))
+    for artist in drawn:
+        if to_hex(artist.get_color()) == "#000000":
+            artist.set_color(INK)
+    for axis in figure.axes:
+        axis.tick_params(which="both", color=INK)
+        axis.spines[:].set_color(INK)
 
 
 def save_measured(path: Path, title: str, draw: Callable[..., Figure], *arguments: Any) -> None:
@@ -60,7 +82,7 @@ def save_measured(path: Path, title: str, draw: Callable[..., Figure], *argument
 
 def add_frame(axis: Axes, lines: Literal["both", "x", "y"] = "both") -> None:
     """Give axes a grid behind their curves and no lines above and to the right."""
-    axis.grid(axis=lines, color=GRID_COLOUR, linewidth=0.7)
+    axis.grid(axis=lines, color=INK, alpha=0.25, linewidth=0.7)
     axis.set_axisbelow(True)
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(labelsize=8)
@@ -222,7 +244,7 @@ def draw_maps(columns: Sequence[Sequence[RoadMap]], height: float = 1.1) -> Figu
 
 def _draw_map(axis: Axes, panel: RoadMap, n_columns: int) -> AxesImage:
     values = np.array(panel.seconds).T[panel.history.rows]
-    axis.set_title(fill(panel.title, 56 // n_columns), loc="left", fontsize=9, pad=3, color=INK)
+    axis.set_title(fill(panel.title, 56 // n_columns), loc="left", fontsize=9, pad=3)
     axis.tick_params(labelsize=8)
     return axis.imshow(
         values,
@@ -235,7 +257,7 @@ def _draw_map(axis: Axes, panel: RoadMap, n_columns: int) -> AxesImage:
             0.0,
             panel.history.road_length,
         ),
-        cmap="Greys" if panel.is_flags else DENSITY_MAP,
+        cmap=SHADES if panel.is_flags else DENSITY_MAP,
         vmin=0.0,
         vmax=1.0 if panel.is_flags else panel.history.density_scale,
     )
@@ -262,13 +284,13 @@ LABELS = {
 }
 """Names of the estimators in figures and tables."""
 ESTIMATOR_LOOKS = {
-    "ekf": Look("#0072b2", "o"),
+    "ekf": Look("#1a80c4", "o"),
     "ukf": Look("#d55e00", "s"),
     "enkf": Look("#009e73", "^"),
     "mhe": Look("#cc79a7", "D"),
-    "random_walk": Look("#666666", "v", "--"),
+    "random_walk": Look(INK, "v", "--"),
     "blend": Look("#56b4e9", "P"),
-    "open_loop": Look("#000000", "", ":"),
+    "open_loop": Look(INK, "", ":"),
 }
 
 
@@ -290,14 +312,14 @@ def draw_curve(
 
 def draw_level(axis: Axes, interval: Interval, label: str) -> None:
     """Draw a mean that no place changes as a line with a band."""
-    axis.axhline(interval.mean, color=GREY, linestyle=":", linewidth=1.3, label=label)
-    axis.axhspan(interval.low, interval.high, color=GREY, alpha=0.11, linewidth=0)
+    axis.axhline(interval.mean, color=INK, linestyle=":", linewidth=1.3, label=label)
+    axis.axhspan(interval.low, interval.high, color=INK, alpha=0.2, linewidth=0)
 
 
 def draw_rules(axis: Axes, rules: Mapping[str, float]) -> None:
     """Draw the errors of rules as lines with their names, side by side lest they overlap."""
     for k, (rule, error) in enumerate(sorted(rules.items(), key=lambda each: each[1])):
-        axis.axhline(error, color=GREY, linestyle=":", linewidth=1.0)
+        axis.axhline(error, color=INK, linestyle=":", linewidth=1.0)
         axis.annotate(
             rule, (1.0 - 0.2 * (k % 5), error), xycoords=("axes fraction", "data"),
             fontsize=7, ha="right", va="bottom",

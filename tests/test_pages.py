@@ -40,7 +40,7 @@ def broken(page):
 
 
 def test_a_moving_picture_is_small_and_has_a_still_beside_it():
-    moving = list((ROOT / "docs" / "images").glob("*.gif"))
+    moving = list((ROOT / "docs" / "images").glob("*.webp"))
     assert moving
     for path in moving:
         assert path.stat().st_size < 1_000_000
@@ -104,7 +104,7 @@ def test_the_site_is_refused_with_dead_links_and_with_files_of_other_hosts(tmp_p
     ]
 
 
-PAGE = """![a road](docs/road.gif) [`env`](a/env.py), [there](docs/a.md#b), [far](https://far.example).
+PAGE = """![a road](docs/road.webp) [`env`](a/env.py), [there](docs/a.md#b), [far](https://far.example).
 [below](#below)
 ```python
 tools["a"](b)

@@ -375,11 +375,11 @@ LEDGER_NOTE = (
 LOOKS = {
     "event": Look("#009e73", "s"),
     "trip, C = 4": Look("#92c5de", "o"),
-    "trip, C = 16": Look("#4393c3", "o"),
-    TRIP: Look("#08306b", "o"),
+    "trip, C = 16": Look("#56a9dd", "P"),
+    TRIP: Look("#1a80c4", "X"),
     "horizon": Look("#d55e00", "^"),
     PRINTED: Look("#cc79a7", "D"),
-    CORRECTED: Look("#7d5ba6", "v"),
+    CORRECTED: Look("#9370bd", "v"),
 }
 
 

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from agents.figures import (
     COLOURS,
     ERROR_TICKS,
+    SHADES,
     WIDTH,
     Look,
     add_frame,
@@ -136,8 +137,8 @@ def draw_queries() -> Figure:
         truth = np.array(watched.history.truth)[SHOWN].T
         n, seconds = truth.shape
         image = axis.imshow(
-            truth, origin="lower", aspect="auto", cmap="Greys", interpolation="nearest",
-            vmin=0.0, vmax=1.3 * watched.history.density_scale,
+            truth, origin="lower", aspect="auto", cmap=SHADES, interpolation="nearest",
+            vmin=0.0, vmax=watched.history.density_scale,
             extent=(SHOWN.start - 0.5, SHOWN.start + seconds - 0.5, -0.5, n - 0.5),
         )  # fmt: skip
         segment, second = np.nonzero(np.array(watched.history.queried)[SHOWN].T)
@@ -199,7 +200,7 @@ def draw_observation() -> Figure:
     for row, part in zip(table, slices.values(), strict=True):
         own = observation[part]
         row[: own.size] = (own - own.min()) / max(np.ptp(own), 1e-9)
-    image = axis.pcolormesh(table, cmap="cividis", vmin=0.0, vmax=1.0, edgecolors="white", lw=0.8)
+    image = axis.pcolormesh(table, cmap="cividis", vmin=0.0, vmax=1.0, edgecolors="none")
     axis.invert_yaxis()
     names = [f"{name}  [{part.start}:{part.stop}]" for name, part in slices.items()]
     axis.set_yticks(np.arange(len(slices)) + 0.5, names, fontsize=7.5)

@@ -1,4 +1,4 @@
-"""Draw an episode as a moving picture, and one second of it: docs/images/episode.gif and .png.
+"""Draw an episode as a moving picture, and one second of it: docs/images/episode.webp and .png.
 
 A rule queries two of fifteen segments a second, under ``paced``. An incident stops the traffic on
 one of them. Below are the errors of the rule and of the paper's schedule, with the same estimator.
@@ -21,7 +21,7 @@ from matplotlib.patches import FancyBboxPatch
 from PIL import Image
 
 from agents.environments import make_config
-from agents.figures import COLOURS, INK, add_frame
+from agents.figures import COLOURS, INK, add_frame, turn_grey
 from agents.page import watch
 from agents.play import Cell
 from dptse_env.rendering import History
@@ -39,14 +39,14 @@ SEED, STILL = 2009, 284
 SECONDS = range(120, 500, 4)
 FRAME = 110  # milliseconds
 SHADES = "YlOrRd"  # pale is empty, dark red a jam
-NOW, EARLIER, IDLE = COLOURS[0], "#a8cbe2", "#eef1f5"  # when a segment was queried
+NOW, EARLIER, IDLE = COLOURS[0], (COLOURS[0], 0.4), (INK, 0.2)  # when a segment was queried
 TRUTH, QUERIES, ESTIMATE = 2.2, 1.25, 0.0  # heights of the strips
 STRIPS = {
     TRUTH: ("traffic", "as it is"),
     QUERIES: ("queries", "two a second"),
     ESTIMATE: ("estimate", "noisy sums"),
 }
-LINES = {"paper's schedule": (COLOURS[1], 1.5), "this rule": (INK, 2.0)}
+LINES = {"paper's schedule": (COLOURS[1], 1.5), "this rule": (COLOURS[0], 2.0)}
 LARGEST = 200.0  # density at the end of the colours [veh/km]
 MEMORY = 20  # seconds over which errors are averaged
 LEFT, RIGHT = 0.19, 0.865  # of the road and the curve, as shares of the width
@@ -135,6 +135,9 @@ class Film:
         curve.set_xlabel("time [s]", size=9)
         curve.set_ylabel("density error\n[veh/km]", size=9)
         add_frame(curve, "y")
+        turn_grey(self.figure)
+        self.figure.patch.set_visible(False)
+        curve.patch.set_visible(False)
 
     def _add_bar(self) -> None:
         shades = ScalarMappable(Normalize(0, LARGEST), SHADES)
@@ -164,24 +167,25 @@ class Film:
             mean = np.sqrt(np.mean(np.square(errors[SECONDS[0] : second + 1])))
             text.set_text(f"{name}: {mean:.1f} veh/km")
         self.canvas.draw()
-        return Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3].copy())
+        return Image.fromarray(np.array(self.canvas.buffer_rgba()))
 
 
 def save_moving(frames: list[Image.Image], path: Path) -> None:
-    """Save frames as a GIF with one palette."""
-    palette = frames[len(frames) // 2].quantize(200, Image.Quantize.MAXCOVERAGE)
-    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    """Save frames as a WebP, whose pixels may be half transparent; few colours keep it small."""
+    few = (frame.quantize(128, Image.Quantize.FASTOCTREE) for frame in frames)
+    first, *others = (frame.convert("RGBA") for frame in few)
     with replacing(path) as temporary:
         first.save(
-            temporary, format="GIF", save_all=True, append_images=others, duration=FRAME, loop=0
-        )
+            temporary, format="WEBP", save_all=True, append_images=others, duration=FRAME, loop=0,
+            lossless=True, quality=50, method=2,
+        )  # fmt: skip
 
 
 def main() -> None:
     """Write the moving picture and the still."""
     folder = Path(__file__).parents[1] / "images"
     film = Film(play())
-    save_moving([film.draw(second) for second in SECONDS], folder / "episode.gif")
+    save_moving([film.draw(second) for second in SECONDS], folder / "episode.webp")
     with replacing(folder / "episode.png") as temporary:
         film.draw(STILL).save(temporary, format="PNG", optimize=True)
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from matplotlib.patches import Rectangle
 
-from agents.figures import COLOURS, GRID_COLOUR, WIDTH, add_frame, make_figure, save_figure
+from agents.figures import COLOURS, INK, WIDTH, add_frame, make_figure, save_figure
 from dptse_env.importers.sumo_net import Files, Segmentation, segment_path
 from dptse_env.schedules import make_schedule
 from dptse_env.traffic import Corridor, read_corridor
@@ -46,7 +46,7 @@ def draw_network(net: Path, segments: Segmentation) -> Figure:
     for edge in network.getEdges(withInternal=True):
         for lane in edge.getLanes():
             axis.plot(
-                *np.array(lane.getShape()).T, color=GRID_COLOUR, lw=2.5, solid_capstyle="butt"
+                *np.array(lane.getShape()).T, color=INK, alpha=0.25, lw=2.5, solid_capstyle="butt"
             )
     n, n_ramps = segments.geometry.n_mainline, segments.geometry.n_ramps
     colours = [MAINLINE[number % 2] for number in range(n)] + [RAMP] * n_ramps
@@ -67,7 +67,7 @@ def draw_network(net: Path, segments: Segmentation) -> Figure:
     axis.legend(handles=handles, loc="upper left", frameon=False, fontsize=8)
     axis.annotate(
         "", (0.95, 0.22), (0.8, 0.16), xycoords="axes fraction", textcoords="axes fraction",
-        arrowprops={"arrowstyle": "->", "color": "black"},
+        arrowprops={"arrowstyle": "->", "color": INK},
     )  # fmt: skip
     axis.annotate("traffic", (0.87, 0.08), xycoords="axes fraction", ha="center", fontsize=9)
     axis.set_aspect("equal")
@@ -108,14 +108,14 @@ def draw_road(corridor: Corridor) -> Figure:
 
     def box(segment: int, left: float, bottom: float, colour: str) -> None:
         width, lanes = float(lengths[segment]), corridor.geometry.segment_lanes[segment]
-        axis.add_patch(Rectangle((left, bottom), width, lanes, facecolor=colour, edgecolor="white"))
+        axis.add_patch(Rectangle((left, bottom), width, lanes, fc=(colour, 0.3), ec=INK))
         middle = (left + width / 2, bottom + lanes / 2)
         axis.annotate(f"{segment}", middle, ha="center", va="center", fontsize=7)
         if segment in corridor.fixed_sensors:
             axis.plot(left + width / 2, bottom + lanes - 0.25, "v", color=COLOURS[1], markersize=5)
 
     for segment in range(n):
-        box(segment, float(starts[segment]), 0.0, "#c9d6e3")
+        box(segment, float(starts[segment]), 0.0, COLOURS[0])
     groups = [(*corridor.geometry.on_ramps, *corridor.geometry.off_ramps)]
     ramps = (*corridor.geometry.on_ramp_segments, *corridor.geometry.off_ramp_segments)
     for face, segments in zip(*groups, ramps, strict=True):
@@ -124,16 +124,16 @@ def draw_road(corridor: Corridor) -> Figure:
         if joins:
             left -= float(lengths[list(segments)].sum())
         for segment in segments:
-            box(segment, left, -1.6 - corridor.geometry.segment_lanes[segment], "#e3d6c9")
+            box(segment, left, -1.6 - corridor.geometry.segment_lanes[segment], COLOURS[1])
             left += float(lengths[segment])
         place = float(starts[face])
         ends = ((place, -0.05), (place, -1.5)) if joins else ((place, -1.5), (place, -0.05))
-        axis.annotate("", *ends, arrowprops={"arrowstyle": "->", "color": "#777"})
+        axis.annotate("", *ends, arrowprops={"arrowstyle": "->", "color": INK})
     limits = corridor.geometry.speed_limits[:n]
     for segment in range(n):
         if segment == 0 or limits[segment] != limits[segment - 1]:
             at = (float(starts[segment]), most + 0.3)
-            axis.annotate(f"{limits[segment]:g} km/h", at, fontsize=7, color="#555")
+            axis.annotate(f"{limits[segment]:g} km/h", at, fontsize=7)
     axis.set_xlim(-0.02 * starts[-1], 1.02 * starts[-1])
     axis.set_ylim(-4.2 if corridor.geometry.n_ramps else -0.6, most + 1.2)
     axis.set_yticks([])

@@ -127,8 +127,7 @@ def add_title(axis: Axes, text: str, colour: str = "black") -> None:
 
 def say(axis: Axes, at: tuple[float, float], text: str, colour: str) -> None:
     """Write into a panel."""
-    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5}
-    axis.text(*at, text, fontsize=7.5, color=colour, bbox=box)
+    axis.text(*at, text, fontsize=7.5, color=colour)
 
 
 def main() -> None:

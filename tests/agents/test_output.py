@@ -113,6 +113,29 @@ def test_a_wide_figure_is_made_as_narrow_as_a_page():
     assert make_figure(2.0 * WIDTH, 3.0).get_size_inches().tolist() == [WIDTH, 0.8 * 3.0]
 
 
+def contrast(inks, page):
+    """Return WCAG's contrast of colours, shape (n, 3), with the colour of a page."""
+    shares = np.vstack([inks, page]) / 255.0
+    linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    light = linear @ [0.2126, 0.7152, 0.0722] + 0.05
+    return np.maximum(light[:-1] / light[-1], light[-1] / light[:-1])
+
+
+@pytest.mark.parametrize("page", [(255, 255, 255), (13, 17, 23)])
+def test_what_is_black_in_a_figure_is_read_on_white_and_on_dark_pages(page, tmp_path):
+    figure = make_figure(3.0, 2.0)
+    axis = figure.subplots()
+    axis.plot([0, 1], [0, 1], color="black")
+    axis.set_title("a panel")
+    save_figure(figure, tmp_path / "figure.png", "a title")
+    with Image.open(tmp_path / "figure.png") as saved:
+        pixels = np.asarray(saved)
+    assert pixels[0, 0, 3] == 0
+    inks = np.unique(pixels[pixels[..., 3] == 255][:, :3], axis=0)
+    assert len(inks) > 0
+    assert contrast(inks, page).min() > 4.0
+
+
 def test_the_page_has_what_happened_and_needs_no_network(episode, tmp_path, monkeypatch):
     table = ("policy", "density RMSE\n[veh/km]"), [("shift-ahead", "10.5 ± 1.0")]
     path = tmp_path / "page.html"

@@ -31,7 +31,7 @@ BESIDE_THEM = {
     "pyproject.toml", "zensical.toml",
 }  # fmt: skip
 IN_A_SOURCE_ARCHIVE = IN_A_WHEEL | {
-    ".bib", ".css", ".gif", ".ipynb", ".jsonl", ".md", ".npz", ".png", ".yaml", ".yml"
+    ".bib", ".css", ".ipynb", ".jsonl", ".md", ".npz", ".png", ".webp", ".yaml", ".yml"
 }  # fmt: skip
 
 LARGEST = 4_000_000
