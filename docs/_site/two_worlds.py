@@ -117,7 +117,7 @@ def draw_others(axis: Axes, rest: Record, n_mainline: int) -> None:
     for vehicle in range(0, rest.n_vehicles, 5):
         trip = Trajectory.from_record(rest, vehicle)
         trip = trip.only(trip.segment < n_mainline)
-        axis.plot(trip.step, trip.segment, color=COLOURS[-1], lw=0.5, alpha=0.4)
+        axis.plot(trip.step, trip.segment, color=COLOURS[-1], lw=0.5, alpha=0.3)
 
 
 def add_title(axis: Axes, text: str, colour: str = "black") -> None:
