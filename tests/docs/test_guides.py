@@ -36,9 +36,6 @@ GUIDES = {
         "1_000_000": "8192",
         'num_envs=8, traffic_seeds="2000:2008"': 'num_envs=2, traffic_seeds="2000:2002"',
         "range(2000, 2008)": "range(2000, 2002)",
-        'gym.make(id, traffic_seeds="2000:2008"': 'gym.make(id, traffic_seeds="2000:2002"',
-        "n_eval_episodes=8": "n_eval_episodes=2",
-        " / 8 for": " / 2 for",
     },
     "compare-policies.md": {
         "--fresh 8": "--fresh 2 --workers 1",
