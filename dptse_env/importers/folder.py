@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from dptse_env.importers.measured import measure
 from dptse_env.importers.placing import Branches
@@ -30,6 +31,8 @@ from dptse_env.utils.files import hidden, left_hidden, require_output
 from dptse_env.utils.validation import require, require_name
 
 ROAD = "road.toml"
+LOCK = ".lock"
+"""File that a process holds while it makes a folder."""
 NO_SPACE = 2**16
 """Free space below which a disk is full [bytes]."""
 DATES = 1e8
@@ -231,19 +234,21 @@ def new_folder(output: Path) -> Iterator[Path]:
     a process that was killed goes, too.
 
     Raises:
-        ValueError: There is something at `output`, or it cannot be written.
+        ValueError: There is something at `output`, it cannot be written, or another process makes
+            it.
         OSError: The disk is full.
     """
     require_new(output)
     output.parent.mkdir(parents=True, exist_ok=True)
     work = hidden(output.absolute())
     for left in left_hidden(output):
-        shutil.rmtree(left, ignore_errors=True)
+        _remove_left(left, output)
     folder = work / "result"
     folder.mkdir(parents=True)
     try:
-        yield folder
-        folder.rename(output)
+        with FileLock(work / LOCK):
+            yield folder
+            folder.rename(output)
     except Exception as problem:
         # Whatever else is said then, such as that a file of ours which was cut off is malformed.
         if shutil.disk_usage(work).free < NO_SPACE:
@@ -251,3 +256,17 @@ def new_folder(output: Path) -> Iterator[Path]:
         raise
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _remove_left(work: Path, output: Path) -> None:
+    """Remove what a process that was killed has left; refuse what one still works in."""
+    try:
+        with FileLock(work / LOCK, timeout=0):
+            pass
+    except Timeout as held:
+        raise ValueError(
+            f"output must be made by one process at a time, got {output}, which another one makes"
+        ) from held
+    except OSError:  # another user's
+        return
+    shutil.rmtree(work, ignore_errors=True)

@@ -116,16 +116,17 @@ def scan(path: Path, form: Format, source: Source) -> Table:
     lengths = dict.fromkeys(("x", "y", "extent"), "length")
     columns: dict[str, Any] = {"row": pl.col(ROW).cast(pl.Int64)}
     for role, name in roles.items():
-        if role in LABELS:
-            columns[role] = _label(kinds[name], name, role)
+        is_label, kind = role in LABELS, kinds[name]
+        fits = not kind.is_nested() if is_label else kind.is_numeric()
+        if not (fits or kind in (pl.String, pl.Null)):
+            allowed = "numbers or texts" if is_label else "numbers"
+            raise TrajectoryError(f"{path}: {cut(name)} must be {allowed}, got {cut(str(kind))}")
+        if is_label:
+            columns[role] = _label(kind, name, role)
             continue
-        if not (kinds[name].is_numeric() or kinds[name] in (pl.String, pl.Null)):
-            raise TrajectoryError(
-                f"{path}: {cut(name)} must be numbers, got {cut(str(kinds[name]))}"
-            )
         quantity = lengths.get(role, role)
         factor = source.factor(quantity, form.units[quantity])
-        columns[role] = _number(kinds[name], name, grouped) * factor
+        columns[role] = _number(kind, name, grouped) * factor
     for name, value in source.where.items():
         found = _find(path, name, names, "source.where")
         # Rows without a vehicle tell times alone.
@@ -194,7 +195,9 @@ def _text(path: Path, form: Format) -> _Raw:
     with open_unzipped(path) as file:
         text = file.read(HEAD).decode("utf-8-sig", errors="replace")
     if "\0" in text:
-        raise TrajectoryError(f"{path}: it must be text in UTF-8, got bytes of 0, as in UTF-16")
+        raise TrajectoryError(
+            f"{path}: it must be text in UTF-8, got bytes of 0, as in UTF-16 and in packed files"
+        )
     first = text.partition("\n")[0].rstrip("\r")
     if not first.strip():
         raise TrajectoryError(f"{path}, row 1: a header or data must be there, got an empty line")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dptse_env.importers import Layout, Source, Strip
-from dptse_env.importers.folder import assign_seeds
+from dptse_env.importers.folder import assign_seeds, new_folder
 from dptse_env.importers.road_file import write_road
 from dptse_env.traffic import PAPER_HIGHWAY, Demand, read_corridor
 from tests.importers.data import PLAIN, ROAD, SPLITS, plain, run, stream
@@ -102,6 +102,21 @@ def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
         run(path)
     left = {each.name for each in tmp_path.iterdir()}
     assert left == {"a.csv", ".imported-else-" + 32 * "f"}
+
+
+def test_two_imports_to_one_folder_do_not_touch_each_other(tmp_path):
+    output = tmp_path / "imported"
+    with new_folder(output) as folder:
+        (folder / "work").touch()
+        with (
+            pytest.raises(
+                ValueError, match=r"output must be made by one .*imported, which another"
+            ),
+            new_folder(output),
+        ):
+            pass
+    assert [each.name for each in output.iterdir()] == ["work"]
+    assert [each.name for each in tmp_path.iterdir()] == ["imported"]
 
 
 def test_a_mainline_that_nobody_drives_on_is_told(tmp_path):

@@ -248,8 +248,10 @@ def test_a_column_is_that_of_its_own_spelling(tmp_path, expected):
 
 LONG = "x" * 100_000
 DOCUMENT = i24(stream())[0]
-DATES = io.BytesIO()
-pl.DataFrame({"t": [0], "id": 1, "s": 2, "v": 3}).cast({"t": pl.Date}).write_parquet(DATES)
+POINT = pl.DataFrame({"t": [0], "id": 1, "s": 2, "v": 3})
+DATES, NESTED = io.BytesIO(), io.BytesIO()
+POINT.cast({"t": pl.Date}).write_parquet(DATES)
+POINT.with_columns(pl.concat_list(pl.lit("a")).alias("id")).write_parquet(NESTED)
 BAD = {
     "a.csv": [
         ("", "the file is empty"),
@@ -259,6 +261,7 @@ BAD = {
         ("t,id,x,v\n0,1,2,3\n", r"source\.columns\.x must be .*'s'; found \['t', 'id', 'x', 'v'\]"),
         (b"t,id,s,v\n0,\xff,2,3\n", "must be text in UTF-8, got invalid utf-8 sequence"),
         ("t,id,s,v\n0,1,2,3\n".encode("utf-16"), "must be text in UTF-8, got bytes of 0"),
+        (b"PK\x03\x04\x14\x00 a.csv", "got bytes of 0, as in UTF-16 and in packed files"),
         ("t;id;s;v\n0;1;2,5;3\n", "row 2: s must be a finite number with a point, got '2,5'"),
         ("t,\rid,s,v\n0,1,2,3\n", "the file cannot be read: new-line character"),
         (f"t,id,s,v\n0,1,{LONG},3\n", "row 2: s must be"),
@@ -273,6 +276,7 @@ BAD = {
     "a.parquet": [
         ("PAR1 and no more", "it is no complete Parquet file"),
         (DATES.getvalue(), "got Date"),
+        (NESTED.getvalue(), r"id must be numbers or texts, got List\(String\)"),
     ],
     "a.json": [
         (json.dumps(i24(stream()))[:-2000], "JSON must be a complete array of documents, .*Syntax"),
