@@ -13,11 +13,18 @@ from dptse_env.utils.registry import MissingExtraError, needed_for
 def main() -> None:
     """Run the command that the arguments name."""
     add_tools_path()
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # it was closed, as with ``>&-``
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A pipe on Windows takes fewer letters than a terminal does.
         sys.stdout.reconfigure(errors="replace")
     # Policies and parts of one's own, "module:Class", are found as by ``python -m``.
-    here = str(Path.cwd())
+    try:
+        here = str(Path.cwd())
+    except FileNotFoundError:
+        print("error: the folder that this runs in is gone: choose another one", file=sys.stderr)
+        raise SystemExit(2) from None
     if here not in sys.path:
         sys.path.append(here)
     try:

@@ -147,6 +147,8 @@ class FieldSource:
         density = self._table("density")
         kind = "speed" if self.flow is None else "flow"
         path, other = getattr(self, kind), self._table(kind)
+        is_same = density.shape == other.shape and (density == other).all()
+        require(not is_same, str(path), f"of other values than {self.density}", "the same")
         allowed = f"a table of {self.density}'s shape {density.shape}"
         require(other.shape == density.shape, str(path), allowed, other.shape)
         for words, line, same in (
@@ -228,6 +230,8 @@ class FieldSource:
         """
         each = cells // (segments + 2)
         fewest = max(1, math.ceil(round(SHORTEST_SEGMENT / self.cell, 9)))
+        enough = f"a table of at least {4 * fewest} cells, for segments and both ends of a road"
+        require(cells >= 4 * fewest, str(self.density), enough, cells)
         allowed = (
             f"at most {cells // fewest - 2}, on {cells} cells of {self.cell:g} km, for segments of "
             f"{SHORTEST_SEGMENT:g} km or more"
@@ -365,6 +369,8 @@ class FieldSource:
     def _table(self, kind: str) -> FloatArray:
         path, unit = getattr(self, kind), getattr(self, f"{kind}_unit")
         require_name(f"{kind}_unit", USUAL[kind] if unit is None else unit, UNITS[kind])
+        is_one = self.delimiter is None or len(self.delimiter) == 1
+        require(is_one, "delimiter", "a character, or left out for blanks and tabs", self.delimiter)
         if path.is_dir():
             raise ValueError(f"{path} must be a file, got a directory")
         try:

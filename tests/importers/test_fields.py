@@ -109,14 +109,17 @@ def test_all_windows_may_be_for_tests(tmp_path):
         ({"speed": None}, {}, 100, r"speed must be given, or else flow"),
         ({"density_unit": "cars"}, {}, 100, r"density_unit must be one of veh/km, .*got 'cars'"),
         ({"cell": 0.0}, {}, 100, r"cell must be"),
-        ({"delimiter": ""}, {}, 100, r"density\.txt must be a table of numbers, with '' between"),
+        ({"delimiter": "\\t"}, {}, 100, r"delimiter must be a character, or left out .*\\\\t'"),
+        ({"delimiter": ","}, {}, 100, r"density\.txt must be a table of numbers, with ',' between"),
         ({}, {}, 450, r"duration must be below the field's 450 s, got 450"),
         ({}, {"segments": 9}, 100, r"segments must be at most 8, on 10 cells of 0\.05 km"),
+        ({"cell": 0.013}, {}, 100, r"density\.txt must be a table of at least 16 cells, .*got 10"),
         ({}, {"lanes": 1}, 100, r"speed\.txt: flow must be at most 4000 veh/h on 1 lanes"),
         (b"fast slow\n", {}, 100, r"speed\.txt must be a table of numbers"),
         (b"1 2\n3 4\n", {}, 100, r"speed\.txt must be a table of .*density\.txt's shape"),
         (b"1 2\n-3 4\n", {}, 100, r"speed\.txt: row 2, column 1 must be in \[0, 1e\+06\], or nan"),
         (None, {}, 100, r"speed\.txt must be a file, got a directory"),
+        ("density.txt", {}, 100, r"density\.txt must be of other values than .*density\.txt"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:loadtxt:UserWarning")
@@ -127,6 +130,8 @@ def test_fields_of_no_use_are_refused_and_leave_nothing(changes, road, duration,
     elif changes is None:
         speed.unlink()
         speed.mkdir()
+    elif isinstance(changes, str):
+        source = write(tmp_path, speed=tmp_path / changes)
     else:
         flow = {"flow": tmp_path / "flow.txt"} if "flow_unit" in changes else {}
         source = dataclasses.replace(source, **changes, **flow)

@@ -5,6 +5,7 @@ import errno
 import io
 import json
 import logging
+import os
 import re
 import shlex
 import shutil
@@ -149,6 +150,26 @@ def test_a_pipe_may_lack_letters(monkeypatch):
     print("ε")
     pipe.flush()
     assert pipe.buffer.getvalue().endswith(b"?\n")
+
+
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_a_stream_may_be_closed(name, monkeypatch):
+    monkeypatch.setattr(sys, name, None)
+    monkeypatch.setattr(sys, "argv", ["dptse", "--version"])
+    command_line.main()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows removes no folder that somebody is in")
+def test_a_folder_that_is_gone_is_one_line(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "error: the folder that this runs in is gone: choose another one"
 
 
 def test_ctrl_c_while_the_program_loads_is_one_line(monkeypatch, capsys):
