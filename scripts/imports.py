@@ -338,7 +338,7 @@ class Policy(Import, Replacing):
         path, acts = self.output / POLICY, self.acts == DETERMINISTIC
         read = self.model, self.vecnormalize
         found = import_model(*read, env, keywords, path, deterministic=acts)
-        said = f"{path} is a {found['class']} of action encoding {found['action']!r}"
+        said = f"{path}: {found['class']}, action encoding {found['action']!r}"
         evaluate = "evaluate", "--env", self.env, "--policies", path.as_posix()
         self.tell({"policy": str(path), **found}, [said], evaluate)
 
