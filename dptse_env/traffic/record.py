@@ -230,7 +230,7 @@ class Record:
         """Write the record to the file `path`, completely or not at all.
 
         Args:
-            path: the file; its folders are created, and an existing file is replaced.
+            path: the file; its folders are created, and an existing file or link is replaced.
             source: JSON description of what is recorded, checked again by `load`.
 
         Raises:
@@ -239,6 +239,8 @@ class Record:
         """
         card = _card(source, (self.n_steps, self.n_columns))
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_symlink():  # whose target, anywhere, is no record to replace
+            path.unlink()
         write_tensors(path, self.arrays, card, LARGEST_RECORD)
 
     @classmethod
