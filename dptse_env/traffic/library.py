@@ -64,7 +64,9 @@ _said: set[str] = set()
 def default_path() -> Path:
     """Return the directory named by ``DPTSE_CACHE``, or else the user's cache directory."""
     configured = os.environ.get(CACHE_VARIABLE)
-    return Path(configured) if configured else platformdirs.user_cache_path("dptse-env")
+    if not configured:
+        return platformdirs.user_cache_path("dptse-env")
+    return Path(configured).expanduser()  # a shell does so, containers and services do not
 
 
 class RecordLibrary:

@@ -112,6 +112,20 @@ def test_a_damaged_or_exchanged_record_is_made_again_with_a_logged_warning(
     assert everything_in(tmp_path) == [path]
 
 
+def test_a_record_replaces_a_link_and_not_what_it_leads_to(tmp_path):
+    records, mine = RecordLibrary(tmp_path / "records"), tmp_path / "mine"
+    path = records.record_path(SHORT_HIGHWAY, 0)
+    path.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    for target in (mine, tmp_path / "missing"):
+        path.unlink(missing_ok=True)
+        path.symlink_to(target)
+        RecordLibrary(tmp_path / "records").get(SHORT_HIGHWAY, 0)
+        assert not path.is_symlink()
+    assert mine.read_text() == "mine"
+    assert not (tmp_path / "missing").exists()
+
+
 def test_what_shapes_a_record_is_in_its_path(tmp_path, monkeypatch):
     records = RecordLibrary(tmp_path)
     paths = [
@@ -141,6 +155,10 @@ def test_a_library_pickles_as_its_path_which_the_environment_may_give(tmp_path, 
     assert_same(copy.get(SHORT_HIGHWAY, 0), records.get(SHORT_HIGHWAY, 0))
     monkeypatch.setenv("DPTSE_CACHE", str(tmp_path))
     assert RecordLibrary().path == tmp_path
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    monkeypatch.setenv("DPTSE_CACHE", "~/records")
+    assert RecordLibrary().path == tmp_path / "records"
     monkeypatch.delenv("DPTSE_CACHE")
     assert RecordLibrary().path.name == "dptse-env"
 
