@@ -7,7 +7,7 @@ the same noise under every policy, since noise is drawn for all segments whichev
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -18,7 +18,7 @@ from dptse_env.env import SensorQueryEnv
 from dptse_env.process import QueryProcess
 from dptse_env.schedules import make_schedule
 from dptse_env.utils.arrays import IntArray
-from dptse_env.utils.validation import require
+from dptse_env.utils.validation import integer, require
 from dptse_env.vector_env import SensorQueryVectorEnv
 
 WARM_UP = 60
@@ -110,7 +110,7 @@ def evaluate(
             episodes in the step in which they end. Nothing was played then.
         TypeError: The environment is none of this package.
     """
-    bare = env.unwrapped
+    bare: Any = getattr(env, "unwrapped", env)
     batch: _Single | _Batch
     if isinstance(bare, SensorQueryVectorEnv):
         batch = _Batch(bare)
@@ -118,7 +118,9 @@ def evaluate(
         batch = _Single(env, bare)
     else:
         raise TypeError(f"env must be an environment of dptse_env, got {type(bare).__name__}")
-    seeds, config = [int(seed) for seed in seeds], bare.config
+    listed = isinstance(seeds, Iterable) and not isinstance(seeds, str)
+    require(listed, "seeds", "traffic seeds, such as range(2000, 2008)", seeds)
+    seeds, config = [integer("seeds", seed, 0) for seed in seeds], bare.config
     require(len(seeds) > 0, "seeds", "one or more traffic seeds", seeds)
     known = set(config.traffic_seeds)
     unknown = [seed for seed in seeds if seed not in known]
@@ -234,7 +236,10 @@ def _play(
     process.watchers.append(watch)
     try:
         while not process.over.all():
-            action, state = policy.predict(observation, state, episode_start, deterministic)
+            answer = policy.predict(observation, state, episode_start, deterministic)
+            is_pair = isinstance(answer, tuple) and len(answer) == 2
+            require(is_pair, "policy.predict()", "an action and a state", answer)
+            action, state = answer
             episode_start = np.zeros(n, dtype=bool)
             n_before = len(seconds)
             observation, reward = batch.step(action)

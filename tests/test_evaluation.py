@@ -116,6 +116,15 @@ def test_what_cannot_act_is_no_policy(policy):
         evaluate(make_env(), policy, [0])
 
 
+def test_a_policy_without_a_state_is_refused():
+    class Stateless:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            return oldest(observation)
+
+    with pytest.raises(ValueError, match=r"policy\.predict\(\) must be an action and a state, got"):
+        evaluate(make_env(), Stateless(), [0])
+
+
 def test_the_baseline_is_evaluated_by_its_name():
     rows = dptse_env.evaluate(make_env(), "shift-ahead", seeds=range(2))
     assert rows == evaluate(make_env(), make_schedule("shift-ahead", make_env()), [0, 1])
@@ -182,10 +191,14 @@ def test_a_seed_gives_the_same_noise_under_every_policy_and_another_with_a_noise
     [
         (lambda: make_env(horizon=60), [0], "warm_up must be shorter than an episode, got 60"),
         (make_env, [], "seeds must be one or more"),
+        (make_env, "0:3", r"seeds must be traffic seeds, such as range\(.*, got '0:3'"),
+        (make_env, 0, "seeds must be traffic seeds, .*, got 0"),
+        (make_env, [0.5], "seeds must be an integer"),
         (make_env, [0, 7], r"environment's traffic_seeds \(make .* traffic_seeds=\[0, 7\]\), got "),
         (make_env, range(2000, 2032), r"traffic_seeds='2000:2032'\), got \[2000,"),
         (lambda: make_vector(autoreset_mode="SameStep"), [0], "another autoreset_mode"),
         (lambda: gym.make("CartPole-v1"), [0], "environment of dptse_env, got CartPoleEnv"),
+        (lambda: SHORT, [0], "environment of dptse_env, got str"),
     ],
 )
 def test_what_cannot_be_evaluated_is_refused(env, seeds, message):
