@@ -6,6 +6,7 @@ configuration holds and checks; `dptse_env.parts` makes what it describes.
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -269,6 +270,10 @@ def _corridor(path: str, value: Any, base: Corridor) -> Corridor:
     if isinstance(value, Mapping):
         corridor = _changed(path, value, base)
     else:
+        if isinstance(value, str | os.PathLike) and value not in CORRIDORS:
+            # Unlike `Path`, this takes names that are too long for a file.
+            is_import = os.path.isfile(f"{os.fspath(value)}/road.toml")  # noqa: PTH113
+            require(not is_import, path, "a road file, such as road.toml in this folder", value)
         found = CORRIDORS.find(value)
         corridor = found() if callable(found) else found
         require(isinstance(corridor, Corridor), path, "a Corridor, or what returns one", corridor)

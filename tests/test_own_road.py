@@ -180,6 +180,13 @@ def test_what_does_not_suit_the_road_is_refused(road_file, tmp_path):
     make(str(road), parameters="published", estimator="random_walk").reset(seed=0)
 
 
+def test_the_folder_of_an_import_is_no_road_but_its_file_is(tmp_path):
+    write_corridor(tmp_path / "road.toml", ROAD)
+    for given in (tmp_path, str(tmp_path)):
+        with pytest.raises(ValueError, match=r"^corridor must be a road file, such as road\.toml"):
+            make(given)
+
+
 def test_a_ramp_that_is_too_short_is_named_as_the_file_has_it(tmp_path):
     road = ROAD.replaced(ramp_length=0.05)
     write_corridor(tmp_path / "ramp.toml", road)
