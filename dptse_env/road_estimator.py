@@ -151,9 +151,10 @@ class RoadEstimator:
             seconds: Seconds to go on by, of which a gap has many.
 
         Raises:
-            ValueError: A place is not on the road, or an interval ended more than ten minutes ago,
-                ends in the future, or ended before the stream began. Nothing has changed then, nor
-                after any other exception, Ctrl-C among them.
+            ValueError: A place is not on the road, a station says two things of one interval, or an
+                interval ended more than ten minutes ago, ends in the future, or ended before the
+                stream began. Nothing has changed then, nor after any other exception, Ctrl-C among
+                them.
 
         Warns:
             UserWarning: A point lies within a segment and counts at its border.
@@ -246,7 +247,7 @@ class RoadEstimator:
     def _additions(self, seen: Sequence[Any], now: int) -> Additions:
         """Return what sources add to the stream at second `now`, or refuse them."""
         oldest = max(now - LONGEST, self._start) + 1
-        seconds, segments, told = [], [], []
+        seconds, segments, told, stations = [], [], [], set[tuple[Any, ...]]()
         for i, each in enumerate(seen):
             path, allowed = f"seen[{i}]", "what station(), probes() or Seen() returns"
             require(isinstance(each, Seen), path, allowed, each)
@@ -255,6 +256,11 @@ class RoadEstimator:
             require(in_time, f"{path}.until", f"{allowed}, which can still change", until)
             segments.append(self._segments(path, each))
             n = each.seconds
+            if each.flow is not None:
+                reading = each.start, each.ramp, n, until
+                allowed = "the only reading of its station and interval: add up those of lanes"
+                require(reading not in stations, path, allowed, f"another one at {each.start:g} km")
+                stations.add(reading)
             counts = until - n + 1 + (np.arange(n) if each.flow is None else seconds_told(n))
             seconds.append(counts[counts >= oldest])
             fields = each.density, each.speed, each.density_std, each.speed_std, each.flow

@@ -407,6 +407,7 @@ REFUSED = [
     ([Seen(0.1, 0.1, speed=90, speed_std=9, ramp=3)], r"seen\[0\]\.ramp must be .*, got 3"),
     (loops(0, until=131), r"seen\[0\]\.until must be in 1\.\.130, .*, got 131"),
     (loops(0, until=0), r"seen\[0\]\.until must be in 1\.\.130, .*, got 0"),
+    (loops(0) * 2, r"seen\[3\] must be the only reading of its station and interval"),
     ([*loops(0), (0.1, 0.2)], r"seen\[3\] must be .*, got \(0\.1, 0\.2\)"),
     (Seen(0.1, 0.1, speed=90, speed_std=9), "seen must be"),
     ("abc", r"seen\[0\] must be .*, got 'a'"),
