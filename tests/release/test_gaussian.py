@@ -141,7 +141,7 @@ def squared_distance(release, queries, std=None):
         queries: Observed columns of each second, (seconds, C).
         std: Standard deviations (2,), of densities and flows or speeds; None for those in force.
     """
-    std = release.added_std[0] if std is None else np.tile(std, (COLUMNS, 1))
+    std = release.added_std[0] if std is None else std
     release.reset(BOTH, streams(1, 2))
     total = 0.0
     for t, observed in enumerate(queries, 1):
@@ -212,30 +212,19 @@ def test_on_segments_of_unequal_length_the_whole_of_mu_is_reached():
     assert found == pytest.approx(mu_of(1.0, 0.05) ** 2, rel=1e-8)
 
 
-def test_the_sensitivity_of_the_paper_is_exceeded():
+def test_the_sensitivity_of_the_paper_is_of_the_shortest_segment_and_exceeded():
     """By a vehicle that stands in view for 300 s, in density alone."""
-    steps = 300
-    worlds = Worlds(stays(1, 10.0, steps), stays(2, 10.0, steps))
+    steps, shortest = 300, min(UNEVEN.geometry.segment_lengths)
+    road, n_columns = UNEVEN.replaced(duration=steps), UNEVEN.geometry.n_cells
+    standing = (np.full((1, steps + 1), segment) for segment in (1, 5))
+    worlds = Worlds(*(record(at, 0.0 * at, n_columns) for at in standing), road=road)
     release = worlds.release(PrivacySettings("corrected"))
-    every = np.ones((steps, COLUMNS), dtype=bool)
+    every = np.ones((steps, n_columns), dtype=bool)
     found = squared_distance(release, every, [release.sigma[0], np.inf])
-    claimed = release.report().releases[0]
-    # Two queries, two fixed sensors and four boundary segments, each passed once for the average.
-    dwell = release.task.corridor.scales.average_dwell
-    assert claimed.sensitivity == pytest.approx(10.0 * math.sqrt(2 * 8 * dwell))
-    assert found == pytest.approx(claimed.mu**2 * 2 * steps / (2 * 8 * dwell), rel=1e-12)
-    assert found > 3.0 * claimed.mu**2
-
-
-def test_the_sensitivity_of_the_paper_is_that_of_the_shortest_segment():
-    road = UNEVEN.replaced(duration=T)
-    at = np.zeros((1, T + 1), dtype=int)
-    release = Worlds(record(at, 0.0 * at, road.geometry.n_cells), road=road).release(
-        PrivacySettings("corrected")
-    )
     n_sensors, dwell = dict(release.sensitivity[0].assumptions).values()
-    shortest = math.sqrt(2 * n_sensors * dwell) / min(road.geometry.segment_lengths)
-    assert release.report().releases[0].sensitivity == pytest.approx(shortest)
+    claimed = release.report().releases[0]
+    assert claimed.sensitivity == pytest.approx(math.sqrt(2 * n_sensors * dwell) / shortest)
+    assert found > 3.0 * claimed.mu**2
 
 
 # --- reports -------------------------------------------------------------------------------------
@@ -328,12 +317,6 @@ def test_a_guarantee_is_claimed_for_its_unit_and_charged_until_its_cap(
     np.testing.assert_allclose(mu, found.mu * np.sqrt(parts), rtol=1e-14)
     expected = [epsilon_of(value, 0.05) for value in mu[1:].tolist()]
     np.testing.assert_array_equal(epsilon, [0.0, *expected])
-
-
-def test_true_boundary_inputs_void_the_guarantee():
-    found = privacy_report(capped(boundary_inputs="true"))
-    assert found.guarantee == "none"
-    assert found.void_reasons == ("boundary_inputs",)
 
 
 def test_the_report_describes_the_noise_in_force():

@@ -8,8 +8,9 @@ import pytest
 
 from dptse_env.config import resolve
 from dptse_env.parts import privacy_report
-from dptse_env.release import VOID_REASONS, ReleaseModel
+from dptse_env.release import VOID_REASONS
 from dptse_env.release.report import in_order
+from tests.helpers import SumRelease
 
 OWN = {
     "printed": {"adjacency"},
@@ -83,13 +84,6 @@ PROTECTED = [
 ]
 
 
-@pytest.mark.parametrize(("privacy", "keywords", "protects"), PROTECTED, ids=range(len(PROTECTED)))
-def test_without_loops_a_report_protects_presence_and_names_no_loops(privacy, keywords, protects):
-    found = privacy_report(resolve("private-highway", {"privacy": privacy, **keywords})).to_dict()
-    assert found["protects"] == protects
-    assert "loops" not in str(found)
-
-
 @pytest.mark.parametrize("loops", [None, {"positions": [0.5]}])
 @pytest.mark.parametrize(
     ("sensors", "boundary", "together"),
@@ -123,7 +117,7 @@ CHANGES = {
 
 @pytest.mark.parametrize(("privacy", "keywords", "protects"), PROTECTED, ids=range(len(PROTECTED)))
 @pytest.mark.parametrize("least_count", [0, 2])
-def test_beside_loops_a_report_protects_reports_given_the_readings(
+def test_a_report_protects_presence_and_beside_loops_reports_given_the_readings(
     privacy, keywords, protects, least_count
 ):
     """All numbers stay: nothing is paid for a loop, and nothing is kept for it."""
@@ -134,6 +128,8 @@ def test_beside_loops_a_report_protects_reports_given_the_readings(
     )
     without, beside = without.to_dict(), beside.to_dict()
     assert json.loads(json.dumps(beside)) == beside
+    assert without["protects"] == protects
+    assert "loops" not in str(without)
     for rows, reports in CHANGES.items():
         protects = protects.replace(rows, reports)
     reports = (
@@ -141,26 +137,15 @@ def test_beside_loops_a_report_protects_reports_given_the_readings(
     )
     assert beside.pop("protects") == reports + GIVEN + (ALONE if least_count < 2 else "")
     assert beside.pop("loops") == {**loops, "ramps": []}
-    claims = without.pop("guarantee"), beside.pop("guarantee")
-    if claims[0] == "none":
-        assert claims[1] == "none"
-    else:
-        assert claims[1] == claims[0].replace(without["protects"], reports) + GIVEN
-        assert "none" not in claims[1]
-    del without["protects"]
+    claim = without.pop("guarantee")
+    given = claim if claim == "none" else claim.replace(without.pop("protects"), reports) + GIVEN
+    assert beside.pop("guarantee") == given
+    without.pop("protects", None)
     assert beside == without
 
 
-class Claims(ReleaseModel):
+class Claims(SumRelease):
     """States a guarantee of its own."""
-
-    sigma = np.ones(2)
-
-    def reset(self, episodes, generators):
-        """Nothing to begin."""
-
-    def release(self, request):
-        """Never called."""
 
     def report(self):
         own = {"guarantee": "a claim", "protects": "a trip", "void_reasons": ()}
@@ -168,15 +153,9 @@ class Claims(ReleaseModel):
 
 
 def test_the_claim_of_a_foreign_model_is_conditional_on_loops_too():
-    found = privacy_report(
-        resolve(
-            "short-highway",
-            {
-                "privacy": {"preset": Claims, "boundary_inputs": "nominal"},
-                "loops": {"positions": [0.3], "least_count": 5},
-            },
-        )
-    )
+    privacy = {"preset": Claims, "boundary_inputs": "nominal"}
+    loops = {"positions": [0.3], "least_count": 5}
+    found = privacy_report(resolve("short-highway", {"privacy": privacy, "loops": loops}))
     assert (found.guarantee, found.protects) == ("a claim" + GIVEN, "a trip" + GIVEN)
     assert found.void_reasons == ()
 
