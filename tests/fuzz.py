@@ -3,10 +3,10 @@
     python -m tests.fuzz                     # 1,000 configurations and 400 files, ten minutes
     python -m tests.fuzz --only roads:17     # one of them again
 
-A case is drawn from the seed, its kind and its number, and tried in a process of its own kind: it
-may take `LONGEST` seconds of the processor and `MEMORY` bytes beyond those of the imports. What
-raises anything but a `ValueError` of one line that begins with the keyword or has the file, takes
-longer, needs more, or kills the process, has escaped; the exit status says whether any has.
+A case is drawn from the seed, its kind and its number, and tried in another process: it may take
+`LONGEST` seconds of the processor and `MEMORY` bytes beyond those of the imports. What raises
+anything but a `ValueError` of one line that begins with the keyword or has the file, takes longer,
+needs more, or kills the process, has escaped; the exit status says whether any has.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ import argparse
 import atexit
 import contextlib
 import dataclasses
+import faulthandler
 import gzip
 import io
 import json
 import math
 import multiprocessing
+import resource
 import shutil
 import sys
 import tempfile
@@ -29,7 +31,8 @@ import types
 import typing
 import warnings
 from collections import Counter
-from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import cache
 from pathlib import Path
 
@@ -61,7 +64,7 @@ from dptse_env.utils.validation import Interval, field_hints
 from tests.hostile import ODD, changed, changed_tensors
 from tests.importers.data import PLAIN, SPLITS, STRAIGHT, plain, stream
 from tests.importers.sumo_net.conftest import PATH, motorway
-from tests.importers.test_tables import text_of_ngsim
+from tests.importers.test_tables import i24, text_of_ngsim
 
 LONGEST = 60.0
 """Processor time of a case [s]; those that are in order take a few seconds."""
@@ -70,7 +73,7 @@ MEMORY = 500 * 2**20
 GUARD = 16 * 2**30
 """Bytes that a process may reserve, so that a case does not take all of the machine's."""
 PATIENCE = 600.0
-"""Time after which a case counts as without end, whatever else the machine does [s]."""
+"""Time after which a process is ended, whatever else the machine does [s]."""
 LONGEST_MESSAGE = 1500
 """Characters of a message, its path aside."""
 
@@ -277,43 +280,41 @@ def records(rng, folder):
     )  # fmt: skip
 
 
-KINDS_OF_TRAJECTORIES = ("csv", "csv.gz", "txt", "json", "xml", "parquet")
+def fcd(points):
+    """Points as SUMO writes them, on a road of segments of 100 m."""
+    steps = []
+    for second in np.unique(points[:, 1]):
+        vehicles = "\n".join(
+            f'<vehicle id="{v:.0f}" lane="main_{x // 100:.0f}_0" pos="{x % 100:.3f}" speed="{u}"/>'
+            for v, time, x, u in points
+            if time == second
+        )
+        steps.append(f'<timestep time="{second:.2f}">\n{vehicles}\n</timestep>')
+    return "\n".join(["<fcd>", *steps, "</fcd>"])
+
+
+FORMATS = {
+    "csv": PLAIN,
+    "csv.gz": PLAIN,
+    "txt": Source("ngsim"),
+    "json": Source("i24", layout=Layout(origin=310000.0)),
+    "xml": Source("fcd"),
+    "parquet": PLAIN,
+}
 
 
 def trajectories(rng, folder):
     """Draw a file of trajectories in one of several formats, and import it."""
-    points, kind = stream(seconds=45.0, period=0.5), one_of(KINDS_OF_TRAJECTORIES, rng)
-    path, source = folder / f"a.{kind}", PLAIN
-    text = plain(folder / "plain.txt", points).read_bytes()
-    if kind == "parquet":
-        text = io.BytesIO()
-        pl.read_csv(folder / "plain.txt").write_parquet(text)
-        text = text.getvalue()
-    if kind == "txt":
-        source = Source("ngsim")
-        text = "\n".join(text_of_ngsim(points)).encode()
-    if kind == "json":
-        source = Source("i24", layout=Layout(origin=0.0))
-        documents = [
-            {"_id": int(each), "direction": 1,
-             "timestamp": (points[points[:, 0] == each, 1]).round(4).tolist(),
-             "x_position": (points[points[:, 0] == each, 2] / 0.3048).round(3).tolist(),
-             "y_position": [0.0] * int((points[:, 0] == each).sum())}
-            for each in np.unique(points[:, 0])
-        ]  # fmt: skip
-        text = json.dumps(documents).encode()
-    if kind == "xml":
-        source = Source("fcd")
-        steps = []
-        for second in np.unique(points[:, 1]):
-            here = points[points[:, 1] == second]
-            vehicles = "\n".join(
-                f'<vehicle id="{int(v)}" lane="main_{int(x // 100)}_0" pos="{x % 100:.3f}" '
-                f'speed="{speed}"/>'
-                for v, _, x, speed in here
-            )
-            steps.append(f'<timestep time="{second:.2f}">\n{vehicles}\n</timestep>')
-        text = ("<fcd>\n" + "\n".join(steps) + "\n</fcd>").encode()
+    points, kind = stream(seconds=45.0, period=0.5), one_of(FORMATS, rng)
+    path, source = folder / f"a.{kind}", FORMATS[kind]
+    table, parquet = plain(folder / "plain.txt", points), io.BytesIO()
+    pl.read_csv(table).write_parquet(parquet)
+    text = {
+        "parquet": parquet.getvalue,
+        "txt": lambda: "\n".join(text_of_ngsim(points)).encode(),
+        "json": lambda: json.dumps(i24(points)).encode(),
+        "xml": lambda: fcd(points).encode(),
+    }.get(kind, table.read_bytes)()
     text = changed(text, rng)
     path.write_bytes(gzip.compress(text) if kind == "csv.gz" else text)
     return (
@@ -339,37 +340,41 @@ def fields(rng, folder):
     )
 
 
+SOURCE = """
+format = "table"
+frame_rate = 25
+groups = [1, "a"]
+columns = { time = "t" }
+units = { speed = "m/s" }
+[layout]
+origin = 1.0
+centre_line = [[0, 0], [1, 1]]
+mainline = { lanes = [1, 2], lateral = [0.0, 3.5] }
+"""
+
+
 def cards(rng, folder):
     """Draw a JSON or TOML file of parameters, settings, a mapping or a manifest, and use it."""
     kind = one_of(["parameters", "estimator_settings", "source", "manifest"], rng)
     path = folder / f"{kind}.json"
-    keywords = {kind: str(path), "horizon": 5, "traffic_seeds": [0]}
-    if kind == "parameters":
-        write_parameters(path, load_parameters("w99-3lane"), {"by": "hand"})
-    elif kind == "estimator_settings":
-        settings = dataclasses.asdict(load_settings("ekf-w99-3lane-paced"))
-        settings.pop("demand")
-        write_settings(
-            path, estimator="ekf", parameters="w99-3lane", privacy="paced", settings=settings,
-            provenance={},
-        )  # fmt: skip
-    elif kind == "manifest":
-        road = imported(folder)
-        path = road.parent / "manifest.json"
-        keywords = {"corridor": str(road)}
-    else:
-        path.write_text(
-            'format = "table"\nframe_rate = 25\ngroups = [1, "a"]\n[columns]\ntime = "t"\n'
-            '[units]\nspeed = "m/s"\n[layout]\norigin = 1.0\ncentre_line = [[0, 0], [1, 1]]\n'
-            "[layout.mainline]\nlanes = [1, 2]\nlateral = [0.0, 3.5]\n"
-        )
+    keywords = {"horizon": 5, "traffic_seeds": [0], kind: str(path)}
+    match kind:
+        case "parameters":
+            write_parameters(path, load_parameters("w99-3lane"), {"by": "hand"})
+        case "estimator_settings":
+            settings = dataclasses.asdict(load_settings("ekf-w99-3lane-paced"))
+            del settings["demand"]
+            context = {"estimator": "ekf", "parameters": "w99-3lane", "privacy": "paced"}
+            write_settings(path, **context, settings=settings, provenance={})
+        case "manifest":
+            road = imported(folder)
+            path, keywords = road.parent / "manifest.json", {"corridor": str(road)}
+        case "source":
+            path.write_text(SOURCE)
     path.write_bytes(changed(path.read_bytes(), rng))
-    use = (
-        (lambda: read_source(path))
-        if kind == "source"
-        else (lambda: play("dptse/ShortHighway-v0", keywords))
-    )
-    return path.read_bytes(), use, path
+    if kind == "source":
+        return path.read_bytes(), lambda: read_source(path), path
+    return path.read_bytes(), lambda: play("dptse/ShortHighway-v0", keywords), path
 
 
 @cache
@@ -435,13 +440,8 @@ def verdict(use, place):
 
 
 def peak():
-    """Return the largest memory of this process so far [bytes], 0 on Windows."""
-    if sys.platform == "win32":
-        return 0
-    import resource
-
-    unit = 1 if sys.platform == "darwin" else 1024
-    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    """Return the largest memory of this process so far [bytes]."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def judged(message, place):
@@ -450,13 +450,11 @@ def judged(message, place):
         has_path, length = str(place) in message, len(message.replace(str(place), ""))
     else:
         has_path, length = message.startswith(tuple(place)), len(message)
-    if len(message.splitlines()) != 1:
-        return f"escaped: {len(message.splitlines())} lines: {message:.300}"
-    if not has_path:
-        return f"escaped: no path: {message:.300}"
-    if length > LONGEST_MESSAGE:
-        return f"escaped: {length} characters: {message:.300}"
-    return f"refused: {message}"
+    n_lines = len(message.splitlines())
+    if n_lines == 1 and has_path and length <= LONGEST_MESSAGE:
+        return f"refused: {message}"
+    path = "a" if has_path else "no"
+    return f"escaped: {n_lines} lines, {length} characters, {path} path: {message:.300}"
 
 
 def try_case(seed, kind, number):
@@ -475,50 +473,30 @@ def try_case(seed, kind, number):
     return said, drawn
 
 
-def serve(connection):
-    """Try the cases that come through a pipe, and answer each."""
-    if sys.platform == "linux":
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (GUARD, resource.RLIM_INFINITY))
-    with contextlib.suppress(EOFError):
-        while True:
-            connection.send(try_case(*connection.recv())[0])
+def guard():
+    """Have a process say where it dies, and not take all of the machine's memory."""
+    faulthandler.enable()
+    resource.setrlimit(resource.RLIMIT_AS, (GUARD, resource.RLIM_INFINITY))
 
 
-class Worker:
-    """A process that tries cases, and is replaced when it dies or takes no end."""
+def said_of(*case):
+    """Return the verdict on a case, or end the process where it takes no end."""
+    faulthandler.dump_traceback_later(PATIENCE, exit=True)
+    said, _ = try_case(*case)
+    faulthandler.cancel_dump_traceback_later()
+    return said
 
-    def __init__(self):
-        self._process = None
 
-    def ask(self, case):
-        """Return the verdict on a case."""
-        if self._process is None:
-            self._pipe, other = multiprocessing.Pipe()
-            context = multiprocessing.get_context("spawn")
-            self._process = context.Process(target=serve, args=(other,))
-            self._process.start()
-            other.close()
-        self._pipe.send(case)
+def verdicts(seed, cases):
+    """Yield the kind and number of each case, and the verdict of a process that may die of it."""
+    pool = None
+    for case in cases:
+        pool = pool or ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), guard)
         try:
-            if self._pipe.poll(PATIENCE):
-                return self._pipe.recv()
-            said = f"escaped: it did not end in {PATIENCE:g} s"
-        except EOFError:
-            self._process.join()
-            said = f"escaped: it ended the process, exit code {self._process.exitcode}"
-        self.close()
-        return said
-
-    def close(self):
-        """End the process."""
-        if self._process is not None:
-            self._pipe.close()
-            self._process.join(10.0)
-            self._process.kill()  # where it takes no end
-            self._process.join()
-            self._process = None
+            yield *case, pool.submit(said_of, seed, *case).result()
+        except BrokenProcessPool:
+            pool = None
+            yield *case, "escaped: it ended the process"
 
 
 def cases(configurations, files):
@@ -541,26 +519,15 @@ def main(words=None):
         said, drawn = try_case(args.seed, kind, int(number))
         print(drawn, said, sep="\n")
         return int(said.startswith("escaped"))
-    figures, worker = Counter(), Worker()
-    try:
-        for kind, number in cases(args.configurations, args.files):
-            said = worker.ask((args.seed, kind, number))
-            figures[kind, said.partition(":")[0]] += 1
-            if said.startswith("escaped"):
-                print(f"{kind}:{number} {said}", flush=True)
-    finally:
-        worker.close()
-    print_figures(figures)
-    return int(any(outcome == "escaped" for _, outcome in figures))
-
-
-def print_figures(figures: Mapping[tuple[str, str], int]) -> None:
-    """Print how many cases of each kind worked, were refused and escaped."""
-    outcomes = ("worked", "refused", "escaped")
-    print(f"{'kind':15}{'tried':>9}", *(f"{each:>9}" for each in outcomes))
+    figures, outcomes = Counter(), ("worked", "refused", "escaped")
+    for kind, number, said in verdicts(args.seed, cases(args.configurations, args.files)):
+        figures[kind, said.partition(":")[0]] += 1
+        if said.startswith("escaped"):
+            print(f"{kind}:{number} {said}", flush=True)
+    print(f"{'kind':15}", *(f"{each:>9}" for each in outcomes))
     for kind in KINDS:
-        counts = [figures[kind, each] for each in outcomes]
-        print(f"{kind:15}{sum(counts):9}", *(f"{each:9}" for each in counts))
+        print(f"{kind:15}", *(f"{figures[kind, each]:9}" for each in outcomes))
+    return int(any(outcome == "escaped" for _, outcome in figures))
 
 
 if __name__ == "__main__":
