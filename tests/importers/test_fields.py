@@ -120,6 +120,13 @@ def test_all_windows_may_be_for_tests(tmp_path):
         (b"1 2\n-3 4\n", {}, 100, r"speed\.txt: row 2, column 1 must be in \[0, 1e\+06\], or nan"),
         (None, {}, 100, r"speed\.txt must be a file, got a directory"),
         ("density.txt", {}, 100, r"density\.txt must be of other values than .*density\.txt"),
+        ({"density_unit": None}, {}, 100, r"density\.txt: .* likely veh/ft or veh/m, got"),
+        (
+            {"speed": None, "flow": "flow.txt"},
+            {},
+            100,
+            r"flow\.txt: flow_unit .* likely veh/s, got",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore:loadtxt:UserWarning")
@@ -133,24 +140,11 @@ def test_fields_of_no_use_are_refused_and_leave_nothing(changes, road, duration,
     elif isinstance(changes, str):
         source = write(tmp_path, speed=tmp_path / changes)
     else:
-        flow = {"flow": tmp_path / "flow.txt"} if "flow_unit" in changes else {}
-        source = dataclasses.replace(source, **changes, **flow)
+        files = {"flow": tmp_path / "flow.txt"} if "flow" in changes else {}
+        source = dataclasses.replace(source, **changes | files)
     with pytest.raises(ValueError, match=message):
         import_field(source, dataclasses.replace(ROAD, **road), tmp_path / "road", SPLITS, duration)
     assert {each.name for each in tmp_path.iterdir()} == {"density.txt", "flow.txt", "speed.txt"}
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"density_unit": None}, r"density\.txt: density_unit .* likely veh/ft or veh/m, got"),
-        ({"speed": None}, r"flow\.txt: flow_unit .* likely veh/s, got"),
-    ],
-)
-def test_forgotten_units_are_refused_with_the_likely_one(changes, message, tmp_path):
-    flow = {"flow": tmp_path / "flow.txt"} if "speed" in changes else {}
-    with pytest.raises(ValueError, match=message):
-        write(tmp_path, **changes, **flow).read(4, 110.0)
 
 
 @pytest.mark.parametrize(

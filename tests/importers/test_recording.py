@@ -23,6 +23,13 @@ def starts(imported):
     return [window["start"] for window in imported.report["windows"]]
 
 
+def assert_alike(imported, expected, seeds=(0, 1)):
+    for seed in seeds:
+        one, other = record_of(imported, seed), record_of(expected, seed)
+        np.testing.assert_array_equal(one.counts, other.counts)
+        np.testing.assert_allclose(one.speed_sums, other.speed_sums)
+
+
 def subfolder(tmp_path, name):
     (tmp_path / name).mkdir()
     return tmp_path / name / "a.csv"
@@ -58,10 +65,7 @@ def test_a_wrong_time_is_counted_and_left_out(stray, tmp_path):
         file = first_file(imported)
         assert file["far_away"] == 1
         assert file["pieces"] == first_file(expected)["pieces"]
-        for seed in (0, 1, 2000):
-            one, other = record_of(imported, seed), record_of(expected, seed)
-            np.testing.assert_array_equal(one.counts, other.counts)
-            np.testing.assert_array_equal(one.speed_sums, other.speed_sums)
+        assert_alike(imported, expected, (0, 1, 2000))
 
 
 def test_times_without_end_are_refused_before_windows_are_laid(tmp_path):
@@ -80,10 +84,8 @@ def test_a_silence_of_over_ten_minutes_begins_another_recording(tmp_path):
     imported = run(plain(tmp_path / "a.csv", np.concatenate([points, later])), splits=ALL)
     assert starts(imported) == [0.0, 21.0, 86_400.0, 86_421.0]
     alone = run(plain(subfolder(tmp_path, "alone"), points), splits=ALL)
+    assert_alike(imported, alone)
     for seed in (0, 1):
-        np.testing.assert_array_equal(
-            record_of(imported, seed).counts, record_of(alone, seed).counts
-        )
         vehicles = record_of(imported, 2 + seed).vehicle
         assert set(vehicles) == {100 + vehicle for vehicle in record_of(alone, seed).vehicle}
 
@@ -147,26 +149,23 @@ ORDERS = {
 @pytest.mark.parametrize("order", ORDERS)
 def test_rows_may_be_in_any_order_of_one_traffic(order, tmp_path):
     points = stream()
-    expected = record_of(run(plain(tmp_path / "a.csv", points)), 1)
+    expected = run(plain(tmp_path / "a.csv", points))
     imported = run(plain(subfolder(tmp_path, "b"), ORDERS[order](points)))
     assert first_file(imported)["steps_back"] == (order == "halves")
-    record = record_of(imported, 1)
-    np.testing.assert_array_equal(record.counts, expected.counts)
-    np.testing.assert_allclose(record.speed_sums, expected.speed_sums)
+    assert_alike(imported, expected)
 
 
-def test_one_id_for_all_vehicles_is_told_before_speeds_are_judged(tmp_path):
-    points = stream(headway=0.8) * [0, 1, 1, 1] + [7, 0, 0, 0]
-    message = r"a\.csv, row \d+: an id must be that of a vehicle, got '7' at over 20 places"
-    with pytest.raises(TrajectoryError, match=message):
-        run(plain(tmp_path / "a.csv", points))
-
-
-def test_an_id_of_its_own_in_each_row_is_told(tmp_path):
-    points = stream()
-    points[:, 0] = np.arange(len(points))
-    message = r"a\.csv: an id must be .* in several rows .*, got none that is"
-    with pytest.raises(TrajectoryError, match=message):
+@pytest.mark.parametrize(
+    ("headway", "one_id", "message"),
+    [
+        (0.8, True, r", row \d+: an id must be that of a vehicle, got '7' at over 20 places"),
+        (4.0, False, r": an id must be .* in several rows .*, got none that is"),
+    ],
+)
+def test_ids_that_are_all_the_same_or_all_different_are_told(headway, one_id, message, tmp_path):
+    points = stream(headway=headway)
+    points[:, 0] = 7 if one_id else np.arange(len(points))
+    with pytest.raises(TrajectoryError, match=rf"a\.csv{message}"):
         run(plain(tmp_path / "a.csv", points))
 
 
@@ -232,9 +231,8 @@ def test_a_curved_road_is_straightened_by_its_centre_line(tmp_path):
     line = [(1000.0 * np.sin(a), 1000.0 * (1.0 - np.cos(a))) for a in np.linspace(0, 0.5, 26)]
     columns = {**PLAIN.columns, "x": "px", "y": "py"}
     source = Source("table", columns, layout=Layout(centre_line=tuple(line)))
-    straight = record_of(run(plain(tmp_path / "a.csv", points)))
-    bent = run(plain(subfolder(tmp_path, "bent"), points, px=x, py=y), source)
-    np.testing.assert_array_equal(record_of(bent).counts, straight.counts)
+    straight = run(plain(tmp_path / "a.csv", points))
+    assert_alike(run(plain(subfolder(tmp_path, "bent"), points, px=x, py=y), source), straight)
 
 
 def test_short_gaps_are_filled_and_longer_ones_and_jumps_cut(tmp_path):
@@ -270,7 +268,7 @@ def test_an_id_that_is_used_again_is_another_vehicle(tmp_path):
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_vehicles_that_share_an_id_at_one_time_are_told_apart(shuffled, tmp_path):
     points = stream(headway=4.0)
-    expected = record_of(run(plain(tmp_path / "a.csv", points)), 1)
+    expected = run(plain(tmp_path / "a.csv", points))
     shared = points.copy()
     shared[:, 0] %= 4  # five are on the road at once
     shared = np.concatenate([shared, shared[300:310]])
@@ -281,9 +279,8 @@ def test_vehicles_that_share_an_id_at_one_time_are_told_apart(shuffled, tmp_path
     assert (file["vehicles"], file["ids_shared"], file["duplicates"]) == (4, 4, 10)
     assert (file["out_of_order"] > 100) == shuffled
     assert file["pieces"] == len(np.unique(points[:, 0]))
+    assert_alike(imported, expected)
     record = record_of(imported, 1)
-    np.testing.assert_array_equal(record.counts, expected.counts)
-    np.testing.assert_allclose(record.speed_sums, expected.speed_sums)
     for vehicle in np.unique(record.vehicle):
         assert (np.diff(record.segment[record.vehicle == vehicle][:-1]) >= 0).all()
     text = (tmp_path / "shared" / "imported" / "report.md").read_text("utf-8")
@@ -299,10 +296,7 @@ def test_vehicles_that_share_an_id_may_have_times_that_alternate(tmp_path):
     shared[:, 0] //= 2
     imported = run(plain(subfolder(tmp_path, "shared"), shared))
     assert first_file(imported)["ids_shared"] == 8  # the last vehicle is alone
-    for seed in (0, 1):
-        one, other = record_of(imported, seed), record_of(expected, seed)
-        np.testing.assert_array_equal(one.counts, other.counts)
-        np.testing.assert_allclose(one.speed_sums, other.speed_sums)
+    assert_alike(imported, expected)
 
 
 def test_rows_off_the_road_are_dropped_and_counted(tmp_path):

@@ -159,12 +159,16 @@ def i24(points, direction=1, first=0):
 LISTS = ("timestamp", "x_position", "y_position")
 
 
-def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expected):
+def test_i24_is_an_array_of_documents_by_vehicle_without_speeds(tmp_path, expected, monkeypatch):
     path = tmp_path / "i24.json"
     path.write_text("\ufeff" + json.dumps(i24(stream()) + i24(stream(), -1, 500)), "utf-8")
     with pytest.raises(TrajectoryError, match=r"\d+ % of the vehicles"):
         run(path, Source("i24", layout=Layout(origin=310000.0)))
     east = Source("i24", where={"direction": 1}, layout=Layout(origin=310000.0))
+    with monkeypatch.context() as patch:
+        patch.setattr("dptse_env.importers.tables.LARGEST_JSON", 1000)
+        with pytest.raises(TrajectoryError, match=r"most 1000 bytes, got more: .*Parquet or CSV"):
+            run(path, east)
     imported = run(path, east)
     np.testing.assert_array_equal(counts(imported), expected)
     np.testing.assert_allclose(RecordLibrary().get(imported.corridor, 0).speed, 72.0, rtol=1e-3)
@@ -185,14 +189,6 @@ def test_i24_may_be_a_table_with_a_row_for_each_point(tmp_path, expected):
     np.testing.assert_array_equal(counts(imported), expected)
 
 
-def test_larger_json_is_asked_for_in_another_format(tmp_path, monkeypatch):
-    path = tmp_path / "i24.json"
-    path.write_text(json.dumps(i24(stream())))
-    monkeypatch.setattr("dptse_env.importers.tables.LARGEST_JSON", 1000)
-    with pytest.raises(TrajectoryError, match=r"at most 1000 bytes, got more: .* Parquet or CSV"):
-        run(path, Source("i24", layout=Layout(origin=310000.0)))
-
-
 @pytest.mark.parametrize("sign", ["-", "_"])
 def test_tgsim_has_runs_and_two_spellings(sign, tmp_path, expected):
     vehicle, time, x, speed = stream().T
@@ -207,35 +203,25 @@ def test_tgsim_has_runs_and_two_spellings(sign, tmp_path, expected):
     assert imported.report["windows"][0]["group"] == "3"
 
 
-def test_tables_may_be_parquet_compressed_or_by_other_delimiters(tmp_path, expected):
-    path = plain(tmp_path / "a.csv", stream())
-    text = path.read_text()
-    (tmp_path / "a.csv.gz").write_bytes(gzip.compress(text.encode()))
-    (tmp_path / "semicolons.csv").write_text(text.replace(",", ";").replace("\n", "\n\n", 3))
-    (tmp_path / "tabs.txt").write_text("\ufeff" + text.replace(",", "\t"), "utf-8")
-    vehicle, time, x, speed = stream().T
-    table = pl.DataFrame({"t": time.round(4), "id": vehicle, "s": x.round(4), "v": speed})
-    table.write_parquet(tmp_path / "a.parquet")
-    for name in ("a.csv.gz", "semicolons.csv", "tabs.txt", "a.parquet"):
-        folder = tmp_path / name.replace(".", "-")
-        folder.mkdir()
-        imported = run([(tmp_path / name).rename(folder / name)])
-        np.testing.assert_array_equal(counts(imported), expected, name)
-
-
 @pytest.mark.parametrize("folder", ["data [2]", "~"])
-def test_paths_are_files_and_no_patterns(folder, tmp_path, monkeypatch, expected):
+def test_tables_of_all_kinds_have_paths_that_are_no_patterns(
+    folder, tmp_path, monkeypatch, expected
+):
     monkeypatch.chdir(tmp_path)
-    Path(folder).mkdir()
-    text = plain(Path(folder) / "p[1].csv", stream()).read_text("utf-8")
-    (Path(folder) / "blanks [1].txt").write_text(text.replace(",", " "), "utf-8")
+    folder = Path(folder)
+    folder.mkdir()
+    text = plain(folder / "p[1].csv", stream()).read_text("utf-8")
+    (folder / "p[1].csv.gz").write_bytes(gzip.compress(text.encode()))
+    (folder / "semicolons.csv").write_text(text.replace(",", ";").replace("\n", "\n\n", 3))
+    (folder / "tabs.txt").write_text("\ufeff" + text.replace(",", "\t"), "utf-8")
+    (folder / "blanks [1].txt").write_text(text.replace(",", " "))
     pl.read_csv(io.StringIO(text)).write_parquet(tmp_path / folder / "p[1].parquet")
-    for path in ("p[1].csv", "blanks [1].txt", "p[1].parquet"):
-        np.testing.assert_array_equal(counts(run(Path(folder) / path)), expected)
-        shutil.rmtree(Path(folder) / "imported")
+    for path in [*folder.iterdir()]:
+        np.testing.assert_array_equal(counts(run(path)), expected, path.name)
+        shutil.rmtree(folder / "imported")
     with pytest.raises(TrajectoryError, match=r"p\*\.csv: the file cannot be read: No such file"):
-        run(Path(folder) / "p*.csv")
-    run(highd(stream(), Path(folder)), Source("highd", groups=("lower",)))
+        run(folder / "p*.csv")
+    run(highd(stream(), folder), Source("highd", groups=("lower",)))
 
 
 def test_a_column_is_that_of_its_own_spelling(tmp_path, expected):
@@ -267,11 +253,19 @@ BAD = {
         (f"t,id,s,v\n0,1,{LONG},3\n", "row 2: s must be"),
         (f"t,id,{LONG},v\n", "row 1: it must have 3 fields, got 4"),
         (",".join(f"c{i}" for i in range(10_000)), "source.columns.time must be"),
+        ("t,id,s,v\n0,1,2,3\n0,2,2,3,7\n", "row 3: it must have 4 fields, got 5$"),
+        ("t,id,s,v\n0,1,2,3\n0,2,2\n", "row 3: it must have 4 fields, got 3$"),
+        ('t,id,s,v\n0,1,2,"3\n0,2,2,3"\n', "row 2: it must have 4 fields, got an open quote$"),
         (None, "the file cannot be read: No such file"),
+    ],
+    "a.txt": [
+        ("1 " * 18 + "\n\n" + "1 " * 17, "row 3: it must have 18 fields, got 17$"),
+        ("1 " * 17, r"row 1: a line without header must have 18 columns .*, got 17$"),
     ],
     "a.csv.gz": [
         ("not compressed", r"source\.columns\.time must be a column of the file, got 't'"),
         (gzip.compress(b"t,id,s,v" * 99)[:-9], "the file cannot be read: Compressed file ended"),
+        (gzip.compress(b"t,id,s,v\n0,1,2\n"), "row 2: it must have 4 fields, got 3$"),
     ],
     "a.parquet": [
         ("PAR1 and no more", "it is no complete Parquet file"),
@@ -300,7 +294,8 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_named_by_row_and_field_in_few_words(name, tmp_path):
     path = tmp_path / name
-    source = Source("i24", layout=Layout(origin=310000.0)) if name == "a.json" else PLAIN
+    i24 = Source("i24", layout=Layout(origin=310000.0))
+    source = {"a.json": i24, "a.txt": Source("ngsim")}.get(name, PLAIN)
     for content, message in BAD[name]:
         if content is None:
             path.unlink() if path.is_file() else None
@@ -310,32 +305,6 @@ def test_bad_files_are_named_by_row_and_field_in_few_words(name, tmp_path):
             run(path, source)
         assert str(refused.value).startswith(str(path))
         assert len(str(refused.value)) < 500 + len(str(path))
-
-
-@pytest.mark.parametrize(
-    ("kind", "change", "got"),
-    [
-        ("csv", "{line},7", 5),
-        ("csv", "{less}", 3),
-        ("csv", '{line},"', "an open quote"),
-        ("csv.gz", "{less}", 3),
-        ("txt", "{line} 7", 19),
-        ("txt", "{less}", 17),
-    ],
-)
-def test_rows_of_another_length_are_refused_with_their_number(kind, change, got, tmp_path):
-    source, separator, lines = Source("ngsim"), None, text_of_ngsim(stream())
-    if kind != "txt":
-        source, separator = PLAIN, ","
-        lines = plain(tmp_path / "a.csv", stream()).read_text().splitlines()
-    fields = lines[4000].split(separator)
-    less = (separator or " ").join(fields[:-1])
-    lines[4000] = change.format(line=lines[4000], less=less)
-    data, path = "\n".join(lines).encode(), tmp_path / f"b.{kind}"
-    path.write_bytes(gzip.compress(data) if kind == "csv.gz" else data)
-    message = rf"row 4001: it must have {len(fields)} fields, got {got}$"
-    with pytest.raises(TrajectoryError, match=message):
-        run(path, source)
 
 
 # -- SUMO ------------------------------------------------------------------------------------------
@@ -377,19 +346,15 @@ def test_imported_fcd_is_the_record_number_for_number(suffix, fcd, tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("fcd.xml", r"fcd\.xml, row \d+: it is no complete XML file"),
-        ("fcd.xml.gz", r"fcd\.xml\.gz, row \d+: it is no complete XML file"),
-        ("fcd.csv.gz", r"fcd\.csv\.gz: the file cannot be read: .*end of file"),
-        ("fcd.parquet", r"fcd\.parquet: it is no complete Parquet file"),
+        ("fcd.xml", r", row \d+: it is no complete XML file"),
+        ("fcd.xml.gz", r", row \d+: it is no complete XML file"),
+        ("fcd.parquet", ": it is no complete Parquet file"),
     ],
 )
 def test_files_that_are_cut_are_refused(name, message, fcd, tmp_path):
-    made = fcd[0] / name
-    if not made.exists():
-        made.write_bytes(gzip.compress(made.with_suffix("").read_bytes()))
-    content = made.read_bytes()
+    content = (fcd[0] / name).read_bytes()
     (tmp_path / name).write_bytes(content[: len(content) * 2 // 3])
-    with pytest.raises(TrajectoryError, match=message):
+    with pytest.raises(TrajectoryError, match=rf"{name}{message}"):
         import_fcd(tmp_path / name, tmp_path)
     assert [each.name for each in tmp_path.iterdir()] == [name]
 
