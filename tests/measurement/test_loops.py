@@ -12,26 +12,29 @@ from dptse_env.process import QueryProcess
 from dptse_env.traffic import CORRIDORS, Loops, RecordLibrary, Stations, readings
 from dptse_env.traffic.loops import borders_of
 
-SEEDS = range(2000, 2004)
 
-
-def error(**keywords):
-    """Mean error of densities over some minutes without a query [veh/km]."""
-    given = {"traffic_seeds": list(SEEDS), "horizon": 240, **keywords}
-    process, every = QueryProcess(resolve("private-highway", given), 4), np.arange(4)
-    streams = [np.random.default_rng(seed) for seed in SEEDS]
-    process.reset(every, streams, {"traffic_seed": list(SEEDS), "start": 300})
-    nothing, errors = np.zeros((4, 15), dtype=np.int8), []
-    for _ in range(240):
-        process.step(every, nothing)
-        errors.append(process.error.density.mean())
-    return float(np.mean(errors))
+def errors(seeds, preset, n_queries, **keywords):
+    """Mean errors of densities by episode, some segments queried round robin [veh/km]."""
+    n = len(seeds)
+    given = {"traffic_seeds": list(seeds), "corridor": {"fixed_sensors": []}, **keywords}
+    process, every = QueryProcess(resolve(preset, given), n), np.arange(n)
+    n_segments = process.config.corridor.geometry.n_mainline
+    streams = [np.random.default_rng([7, seed]) for seed in seeds]
+    process.reset(every, streams, {"traffic_seed": list(seeds), "start": 0})
+    found = []
+    for second in range(process.config.horizon_steps):
+        queries = np.zeros((n, n_segments), dtype=np.int8)
+        queries[:, (second + 3 * np.arange(n_queries)) % n_segments] = 1
+        process.step(every, queries)
+        found.append(process.error.density.copy())
+    return np.mean(found[60:], axis=0)
 
 
 def test_readings_tell_the_estimator_of_the_traffic():
     loops = {"positions": [0.0, 0.5, 1.0, 1.5], "interval": 20}
-    road = {"corridor": {"fixed_sensors": []}, "estimator": "recurrent"}
-    assert error(**road, loops=loops) < 0.8 * error(**road)
+    traffic = range(2000, 2004), "private-highway", 0
+    with_loops, without = (errors(*traffic, horizon=500, loops=each) for each in (loops, None))
+    assert with_loops.mean() < 0.8 * without.mean()
 
 
 def test_processes_that_share_loaded_traffic_read_the_same():
@@ -153,23 +156,6 @@ def test_deviations_are_those_of_readings_of_test_traffic(interval, least, most)
         assert interval == 10 or 0.15 < min(shared) <= max(shared) < 6.0, (speeds, shared)
     nobody = table[table[:, 0] == 4, 1]
     assert nobody.size == 0 or nobody.mean() < most
-
-
-def errors(seeds, preset, n_queries, **keywords):
-    """Mean errors of densities by episode, some segments queried round robin [veh/km]."""
-    n = len(seeds)
-    given = {"traffic_seeds": list(seeds), "corridor": {"fixed_sensors": []}, **keywords}
-    process, every = QueryProcess(resolve(preset, given), n), np.arange(n)
-    n_segments = process.config.corridor.geometry.n_mainline
-    streams = [np.random.default_rng([7, seed]) for seed in seeds]
-    process.reset(every, streams, {"traffic_seed": list(seeds), "start": 0})
-    found = []
-    for second in range(process.config.horizon_steps):
-        queries = np.zeros((n, n_segments), dtype=np.int8)
-        queries[:, (second + 3 * np.arange(n_queries)) % n_segments] = 1
-        process.step(every, queries)
-        found.append(process.error.density.copy())
-    return np.mean(found[60:], axis=0)
 
 
 SOME, PARTLY = [0.0, 0.5, 1.0, 1.5], {"penetration": 0.2}

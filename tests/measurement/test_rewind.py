@@ -271,15 +271,16 @@ def test_nothing_is_left_of_an_episode_that_began_anew():
 
 
 @pytest.mark.parametrize(
-    "copied",
-    [QueryProcess.fork, copy.deepcopy, lambda process: pickle.loads(pickle.dumps(process))],
-    ids=["fork", "deepcopy", "pickle"],
+    ("copied", "estimator"),
+    [
+        (QueryProcess.fork, "ekf"),
+        (copy.deepcopy, "enkf"),
+        (lambda process: pickle.loads(pickle.dumps(process)), "enkf"),
+    ],
 )
-@pytest.mark.parametrize("estimator", ["ekf", "enkf"])
 def test_a_copy_that_is_stepped_like_its_origin_gives_the_same_bits(copied, estimator):
     """From within an interval past the ends of two, and its origin is left alone."""
-    origin = begun(estimator=estimator)
-    expected = begun(estimator=estimator)
+    origin, expected = begun(estimator=estimator), begun(estimator=estimator)
     actions = sampled(origin, 25)
     for action in actions[:5]:
         origin.step(ALL, action)
@@ -295,25 +296,6 @@ def test_a_copy_that_is_stepped_like_its_origin_gives_the_same_bits(copied, esti
             np.testing.assert_array_equal(getattr(here, name), getattr(undisturbed, name))
     assert_alike(origin.estimator, ahead.estimator)
     assert not np.array_equal(other.estimate.density, origin.estimate.density)
-
-
-# --- what is kept ---------------------------------------------------------------------------------
-
-
-def bytes_of(parts):
-    return sum(part.nbytes for part in parts if isinstance(part, np.ndarray))
-
-
-@pytest.mark.parametrize("preset", ["paper-highway", "private-highway", "long-highway"])
-def test_one_state_is_kept_for_an_interval_and_little_more(preset):
-    """At an interval of 20 s less than the estimator's state twice."""
-    loops = {"positions": [0.0, 0.5, 1.0], "interval": 20}
-    config = resolve(preset, {"traffic_seeds": [0], "loops": loops, "estimator": "ekf"})
-    process = QueryProcess(config, 4)
-    (log,) = process.rewind._log.parts
-    rewind = process.rewind
-    kept = bytes_of(rewind._kept) + bytes_of(log) + bytes_of([rewind._estimated])
-    assert kept < 2 * bytes_of(process.estimator.memory)
 
 
 # --- estimators of other packages, and those that cannot go back ----------------------------------

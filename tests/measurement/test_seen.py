@@ -42,25 +42,12 @@ READINGS = [
 ]
 
 
-def test_a_reading_that_cannot_be_is_refused():
-    for changes, message in READINGS:
-        with pytest.raises(ValueError, match=f"^{message}"):
-            station(**READING | changes)
-
-
 PROBES = [
     ({"vehicles": 0}, r"probes\.vehicles must be .*, got 0"),
     ({"spread": 0}, r"probes\.spread must be .*, got 0"),
     ({"speed": NAN}, r"seen\.speed must be .*, got nan"),
     ({"start": 0.3}, r"seen\.end must be .*, got 0\.2"),
 ]
-
-
-def test_probes_that_cannot_be_are_refused():
-    sound = {"start": 0.0, "end": 0.2, "speed": 80.0, "vehicles": 3, "seconds": 60}
-    for changes, message in PROBES:
-        with pytest.raises(ValueError, match=f"^{message}"):
-            probes(**sound | changes)
 
 
 VALUES = [
@@ -75,7 +62,15 @@ VALUES = [
 ]
 
 
-def test_values_and_deviations_come_together():
-    for values, message in VALUES:
+SEGMENT = {"start": 0.0, "end": 0.1}
+STRETCH = {"start": 0.0, "end": 0.2, "speed": 80.0, "vehicles": 3, "seconds": 60}
+
+
+@pytest.mark.parametrize(
+    ("make", "sound", "bad"),
+    [(station, READING, READINGS), (probes, STRETCH, PROBES), (Seen, SEGMENT, VALUES)],
+)
+def test_what_cannot_be_is_refused(make, sound, bad):
+    for changes, message in bad:
         with pytest.raises(ValueError, match=f"^{message}"):
-            Seen(**{"start": 0.0, "end": 0.1} | values)
+            make(**sound | changes)
