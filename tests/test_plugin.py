@@ -15,11 +15,10 @@ from dptse_env.estimators import Estimate, Estimator
 from dptse_env.schedules import make_schedule
 from tests.helpers import SHORT, assert_same, lock_step, play
 
-SOURCE = str(Path(__file__).parent / "plugin")
-sys.path.insert(0, SOURCE)
+sys.path.insert(0, str(Path(__file__).parent / "plugin"))
 
-import dptse_plugin  # noqa: E402
-from dptse_plugin import parts  # noqa: E402
+import dptse_plugin
+from dptse_plugin import parts
 
 KEYWORDS = [keyword for keyword in dptse_plugin.PARTS if keyword != "schedule"]
 
@@ -73,9 +72,8 @@ def test_every_part_serves_in_every_form(form):
         assert_same(play(gym.make(spec), 20), seen)
 
 
-@pytest.mark.parametrize("form", [by_module, as_object])
-def test_a_batch_is_so_many_single_episodes(form):
-    lock_step(keywords(form), 8)
+def test_a_batch_is_so_many_single_episodes():
+    lock_step(keywords(by_module), 8)
 
 
 class Doubtful(parts.LaplaceRelease):
@@ -92,24 +90,6 @@ def test_a_claim_is_shown_as_it_is_made_and_a_reason_against_it_named():
     assert (privacy["guarantee"], privacy["void_reasons"]) == ("a claim", [])
     with pytest.warns(UserWarning, match="no privacy is guaranteed.* a_doubt_of_its_own"):
         gym.make(SHORT, privacy={"preset": Doubtful, "boundary_inputs": "nominal"})
-
-
-@pytest.mark.slow
-def test_spawned_workers_know_modules(monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", SOURCE)
-    envs = gym.make_vec(
-        "dptse_env:dptse/ShortHighway-v0",  # another process knows no id of the tests
-        num_envs=2,
-        vectorization_mode="async",
-        vector_kwargs={"context": "spawn"},
-        bandwidth=2,
-        **keywords(by_module),
-    )
-    try:
-        envs.reset(seed=0)
-        assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
-    finally:
-        envs.close()
 
 
 def test_a_name_is_valid_and_stands_for_one_part():

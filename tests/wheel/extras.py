@@ -6,7 +6,9 @@ import pkgutil
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 
@@ -37,7 +39,7 @@ def main(with_train: bool) -> None:
     """Import every module, and call what wants an extra that is not installed."""
     add_tools_path()
     packages = ("dptse_env", "agents", "scripts") if with_train else ("dptse_env",)
-    lacking = {name: extra for package in packages for name, extra in lacks(package)}
+    lacking = {name: extra for package in packages for name, extra in lacks(package).items()}
     print(f"modules that want an extra: {lacking}")
     reference = {"dptse_env.estimators.reference": "reference"}
     if with_train:
@@ -46,65 +48,50 @@ def main(with_train: bool) -> None:
         train = dict.fromkeys(("dptse_env.importers", "dptse_env.sb3"), "train")
         assert lacking == reference | train, lacking
         for package in ("agents", "scripts"):
-            assert dict(lacks(package)) == {package: "train"}
-    check_corridor()
-    check_pictures(with_train)
+            assert lacks(package) == {package: "train"}
+    check_environments(with_train)
     for extra, commands in (WITH_TRAIN if with_train else WITHOUT_EXTRAS).items():
         for words in commands:
             check_command(extra, words)
 
 
-def lacks(package: str) -> list[tuple[str, str]]:
-    """Import the modules of a package, and return those that lack an extra, with the extra.
+def lacks(package: str) -> dict[str, str]:
+    """Import the modules of a package; return the extra that each lacks, if any.
 
     Raises:
         ImportError: A module lacks something, and does not say which extra brings it.
     """
-    found = []
-
-    def importable(name: str) -> bool:
-        try:
-            importlib.import_module(name)
-        except MissingExtraError as problem:
-            found.append((name, extra_of(str(problem))))
-            return False
-        return True
-
-    if importable(package):
-        module = sys.modules[package]
-        for each in pkgutil.iter_modules(module.__path__, f"{package}."):
-            if each.ispkg:
-                found += lacks(each.name)
-            elif not each.name.endswith(".__main__"):
-                importable(each.name)
+    found, names = {}, [package]
+    while names:
+        name = names.pop()
+        if extra := wanted(importlib.import_module, name):
+            found[name] = extra
+            continue
+        below = pkgutil.iter_modules(getattr(sys.modules[name], "__path__", []), f"{name}.")
+        names += [each.name for each in below if not each.name.endswith(".__main__")]
     return found
 
 
-def check_corridor() -> None:
-    """Make an environment on a road whose net has to be compiled."""
-    env = gym.make("dptse_env:dptse/ShortHighway-v0", corridor=LONGER, bandwidth=1)
-    said = ""
+def wanted(use: Callable[..., Any], *args: Any, **keywords: Any) -> str:
+    """Return the extra that a call lacks, empty for none."""
     try:
-        env.reset(seed=0)
+        use(*args, **keywords)
     except MissingExtraError as problem:
-        said = str(problem)
-    assert extra_of(said) == "corridors"
+        return extra_of(str(problem))
+    return ""
 
 
-def check_pictures(with_train: bool) -> None:
-    """Make environments that show themselves in a window, and in pictures."""
-    wanted = {"human": "video"} if with_train else {"human": "video", "rgb_array": "plot"}
-    for mode, extra in wanted.items():
-        said = ""
-        try:
-            gym.make("dptse_env:dptse/ShortHighway-v0", render_mode=mode)
-        except MissingExtraError as problem:
-            said = str(problem)
-        assert extra_of(said) == extra
+def check_environments(with_train: bool) -> None:
+    """Use a road whose net has to be compiled, a window, and pictures."""
+    env = gym.make(SHORT[1], corridor=LONGER, bandwidth=1)
+    assert wanted(env.reset, seed=0) == "corridors"
+    assert wanted(gym.make, SHORT[1], render_mode="human") == "video"
     if with_train:
-        env = gym.make("dptse_env:dptse/ShortHighway-v0", render_mode="rgb_array")
+        env = gym.make(SHORT[1], render_mode="rgb_array")
         env.reset(seed=0)
         assert env.render().std() > 0
+    else:
+        assert wanted(gym.make, SHORT[1], render_mode="rgb_array") == "plot"
 
 
 def check_command(extra: str, words: list[str]) -> None:

@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,29 +18,27 @@ def main() -> None:
         assert importlib.util.find_spec(extra) is None, f"the core must not need {extra}"
     heavy = {"libsumo", "numba", "torch", "matplotlib"} & set(sys.modules)
     assert not heavy, f"import dptse_env must not import {heavy}"
-    for env_id in ("dptse/PaperHighway-v0", "dptse/ShortHighway-v0"):
-        env = gym.make(f"dptse_env:{env_id}")
-        env.reset(seed=0)
-        env.action_space.seed(0)
-        for _ in range(30):
-            observation, reward, *_ = env.step(env.action_space.sample())
-            assert np.isfinite(observation).all()
-            assert np.isfinite(reward)
-        env.close()
+    short = "dptse_env:dptse/ShortHighway-v0"
+    play(gym.make("dptse_env:dptse/PaperHighway-v0"), 30)
+    play(gym.make(short), 30)
     for estimator in ("random_walk", "ukf", "enkf", "mhe"):
-        env = gym.make(
-            "dptse_env:dptse/ShortHighway-v0", estimator=estimator, parameters="w99-3lane"
-        )
-        env.reset(seed=0)
-        env.step(env.action_space.sample())
-        env.close()
-    envs = gym.make_vec("dptse_env:dptse/ShortHighway-v0", num_envs=3, traffic_seeds="0:1")
-    envs.reset(seed=0)
-    assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
+        play(gym.make(short, estimator=estimator, parameters="w99-3lane"))
+    play(gym.make_vec(short, num_envs=3, traffic_seeds="0:1"))
     use_parts_of_another_package()
     policies = Path(dptse_env.__file__).parent / "policies"
     assert any(policies.glob("*.safetensors")), "a trained policy must come with it"
     print(f"the wheel works with gymnasium {gym.__version__}")
+
+
+def play(env: Any, n_steps: int = 1) -> None:
+    """Play some steps of one episode or several."""
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(n_steps):
+        observation, reward, *_ = env.step(env.action_space.sample())
+        assert np.isfinite(observation).all()
+        assert np.isfinite(reward).all()
+    env.close()
 
 
 def use_parts_of_another_package() -> None:
@@ -48,19 +47,14 @@ def use_parts_of_another_package() -> None:
     keywords = {kind: f"plugin-{kind}" for kind in kinds} | {"bandwidth": 2}
     keywords["observation"] = ["default", "plugin-observation"]
     env = gym.make("dptse_env:dptse/ShortHighway-v0", **keywords)
-    env.reset(seed=0)
     assert env.unwrapped.privacy()["preset"] == "plugin-privacy"
-    assert np.isfinite(env.step(env.action_space.sample())[1])
-    envs = gym.make_vec(
-        "dptse_env:dptse/ShortHighway-v0",
-        num_envs=2,
-        vectorization_mode="async",
-        vector_kwargs={"context": "spawn"},
-        **keywords,
-    )
-    envs.reset(seed=0)
-    assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
-    envs.close()
+    play(env)
+    play(
+        gym.make_vec(
+            "dptse_env:dptse/ShortHighway-v0", num_envs=2, vectorization_mode="async",
+            vector_kwargs={"context": "spawn"}, **keywords,
+        )
+    )  # fmt: skip
 
 
 if __name__ == "__main__":
