@@ -109,17 +109,6 @@ def test_bits_at_the_border_between_two_integers_are_settled_by_more_of_them(sca
         assert next(further, None) is None or next(further, None) is None
 
 
-@pytest.mark.parametrize("scale", [0.75, 1500.3])
-def test_exact_and_fast_noise_agree_wherever_the_fast_one_is_certain(scale):
-    bits = np.random.default_rng(0).integers(2**64, size=300, dtype=np.uint64)
-
-    def none_more():
-        raise AssertionError("64 bits suffice here")
-
-    exact = [rounded_normal(scale, each, none_more) for each in bits.tolist()]
-    np.testing.assert_array_equal(exact, np.rint(scale * normal_of(bits)))
-
-
 def test_where_all_noise_is_in_doubt_releases_are_the_same(monkeypatch):
     """Each number is then settled by itself, and the stream goes on as if none had been."""
     certain = drawn(started(1), BLOCK + 1)
