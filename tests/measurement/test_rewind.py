@@ -144,23 +144,6 @@ def test_a_reading_is_of_the_mean_and_leaves_an_estimate_its_course():
     np.testing.assert_allclose(empty[..., :2], np.tile(said[..., :2], (3, 1, 1, 1)))
 
 
-def test_a_jam_that_comes_within_an_interval_is_not_smoothed_away():
-    """Densities that quadruple in the last third end at twice the minute's mean."""
-    road = {"corridor": {"fixed_sensors": []}, "loops": LOOPS | {"interval": 60}}
-    process = begun(estimator=Remembering, privacy="printed", **road)
-    first = {"traffic_seed": 0, "start": 0}
-    process.reset(ALL, [np.random.default_rng(seed) for seed in SEEDS], first)
-    nothing = np.zeros((4, 6), dtype=np.int8)
-    for second in range(60):
-        if second == 40:
-            process.estimator.held[:, :, 0] = 200.0
-        process.step(ALL, nothing)
-    beside = process.loops.segments
-    read = process.loops.said_until(process.traffic_index, process.time)[..., 0]
-    last, known = process.estimate.density[:, beside], np.isfinite(read)
-    assert (last[known] > 1.8 * read[known]).all()
-
-
 def test_readings_come_at_the_ends_of_intervals_alone():
     """In between, an estimate depends on nothing that an interval will report."""
     with_loops, without = begun(privacy="printed"), begun(privacy="printed", loops=None)

@@ -171,15 +171,6 @@ def test_what_is_spent_grows_to_mu_by_the_largest_charges_of_both_groups(preset)
 # --- the process -------------------------------------------------------------------------------
 
 
-def test_given_noise_reaches_both_groups():
-    process = begun()
-    process.release.give_noise(np.zeros((1, process.release.task.n_channels, 2)))
-    ((released, asked, _),) = play(process, 1)
-    every, some = true_counts(process, asked, 0, 3, 7, 3, 5)
-    counts = released.values[0, [0, 3, *COLUMNS], 0] * LENGTH
-    np.testing.assert_allclose(counts, np.append(some[:2], every[2:]), atol=0.05)
-
-
 def test_a_batch_is_so_many_scalar_environments():
     """Ledgers among their infos, too, which differ in length from record to record."""
     keywords = {"penetration": SHARE, "sensor_settings": {"dropout": 0.3, "absolute": 0.5}}
