@@ -67,4 +67,5 @@ def test_stations_at_the_ends_name_the_segment_where_vehicles_come_or_leave():
     assert stations.enters.tolist() == [0, -1, -1, -1]
     assert stations.leaves.tolist() == [-1, -1, 5, -1]
     assert stations.positions.tolist() == [0.0, 0.3, 0.6, 0.2]
+    assert stations.beside.tolist() == [[0, 0], [2, 3], [5, 5], [6, 6]]
     assert Stations.of(None, geometry).upstream.shape == (0, geometry.n_cells)

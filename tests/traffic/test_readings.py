@@ -200,13 +200,6 @@ def test_an_interval_that_the_record_does_not_end_is_not_told():
     assert read(road, driven({5: UPSTREAM, 6: 0, 35: UPSTREAM, 36: 0}))[..., 0].sum() == 1.0
 
 
-def test_stations_know_the_segments_of_their_flow():
-    stations = Stations.of(SHORT_ROAD.loops, SHORT_ROAD.geometry)
-    assert stations.beside.tolist() == [
-        [0, 0], [0, 1], [2, 2], [2, 3], [4, 4], [4, 5], [5, 5], [ON_RAMP] * 2, [OFF_RAMP] * 2,
-    ]  # fmt: skip
-
-
 def test_a_measured_field_says_of_nobody_who_passes():
     field = Record(n_steps=41, n_columns=SHORT_COLUMNS, field=np.zeros((41, SHORT_COLUMNS, 2)))
     with pytest.raises(ValueError, match=r"corridor\.loops needs the vehicles of a record"):

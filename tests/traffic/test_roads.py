@@ -152,17 +152,14 @@ def test_bad_keywords_of_a_file_are_refused_by_file_and_key(road, line, message)
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    (tmp_path / "folder.toml").mkdir()
-    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    (tmp_path / "deep.toml").write_text("a = " + "[" * 100_000)
-    for name, message in (
-        ("none", "the road file cannot be read"),
-        ("folder", "the road file cannot be read"),
-        ("binary", "a road file must be TOML"),
-        ("deep", "a road file must be TOML"),
-    ):
-        with pytest.raises(ValueError, match=rf"{name}\.toml: {message}"):
-            read_road(tmp_path / f"{name}.toml")
+    path = tmp_path / "road.toml"
+    for content in (b"\xff\xfe\x00", b"a = " + b"[" * 100_000):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"road\.toml: a road file must be TOML"):
+            read_road(path)
+    for missing in (path.with_name("none.toml"), tmp_path):
+        with pytest.raises(ValueError, match=rf"{missing.name}: the road file cannot be read"):
+            read_road(missing)
 
 
 def test_the_keywords_of_a_file_come_after_the_callers(road):
