@@ -506,14 +506,14 @@ def cases(configurations, files):
     yield from ((kinds[n % len(kinds)], n // len(kinds)) for n in range(files))
 
 
-def main(words=None):
+def main():
     """Try all cases; print figures and what has escaped. Return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--configurations", type=int, default=1000)
     parser.add_argument("--files", type=int, default=400)
     parser.add_argument("--only", metavar="KIND:NUMBER", help="one case, with what was drawn")
-    args = parser.parse_args(words)
+    args = parser.parse_args()
     if args.only:
         kind, _, number = args.only.partition(":")
         said, drawn = try_case(args.seed, kind, int(number))
