@@ -4,6 +4,7 @@ import json
 import pickle
 import sys
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import gymnasium as gym
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 
 from dptse_env import register_part
-from dptse_env.estimators import Estimate, Estimator
+from dptse_env.estimators import ESTIMATORS, Estimate, Estimator
 from dptse_env.schedules import make_schedule
+from dptse_env.spaces.rewards import REWARDS
+from dptse_env.utils import registry
 from tests.helpers import SHORT, assert_same, lock_step, play
 
 sys.path.insert(0, str(Path(__file__).parent / "plugin"))
@@ -102,8 +105,16 @@ def test_a_name_is_valid_and_stands_for_one_part():
             register_part(*arguments)
     register_part("reward", "cheap", parts.cheap_queries)
     register_part("reward", "cheap", parts.cheap_queries)
+    assert REWARDS.name_of(parts.cheap_queries) == "cheap"
     with pytest.raises(ValueError, match="reward: 'cheap' is registered already, for another part"):
         register_part("reward", "cheap", lambda second: second.error.density)
+
+
+def test_a_name_is_looked_for_among_installed_packages(monkeypatch):
+    entry = EntryPoint("plugin", "dptse_plugin:register", "dptse_env.plugins")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [entry][: group == entry.group])
+    monkeypatch.setattr(registry, "_plugins_loaded", False)
+    assert ESTIMATORS.find("plugin-estimator") is parts.Smoothed
 
 
 class Duck:
