@@ -224,6 +224,9 @@ def play(env, keywords, n_steps=3):
 
 # --- files ----------------------------------------------------------------------------------------
 
+# Each function returns the damaged file, what is tried with it, and, where another file may be
+# blamed for it, what a message must have instead of its path.
+
 
 def roads(rng, folder):
     """Draw a road file."""
@@ -233,7 +236,7 @@ def roads(rng, folder):
              "estimator_settings": {"process_noise": [0.01, 0.01]}}  # fmt: skip
     write_corridor(path, SHORT_HIGHWAY.replaced(duration=60, incident=None), table)
     path.write_bytes(changed(path.read_bytes(), rng))
-    return path.read_bytes(), lambda: play("dptse/ShortHighway-v0", {"corridor": str(path)}), path
+    return path, lambda: play("dptse/ShortHighway-v0", {"corridor": str(path)})
 
 
 def policies(rng, folder):
@@ -248,7 +251,7 @@ def policies(rng, folder):
         observation = np.zeros(env.observation_space.shape, np.float32)
         assert env.action_space.contains(acting.predict(observation, deterministic=True)[0])
 
-    return path.read_bytes(), act, path
+    return path, act
 
 
 def weights(rng, folder):
@@ -258,7 +261,7 @@ def weights(rng, folder):
     path.write_bytes(changed_tensors(one_of(shipped, rng), rng))
     settings = {"recurrent": {"weights": str(path)}}
     keywords = {"estimator": "recurrent", "estimator_settings": settings, "traffic_seeds": [0]}
-    return path.read_bytes(), lambda: play("dptse/ShortHighway-v0", keywords), path
+    return path, lambda: play("dptse/ShortHighway-v0", keywords)
 
 
 def imported(folder):
@@ -275,9 +278,7 @@ def records(rng, folder):
     road = imported(folder)
     path = road.parent / "records" / "00000000.safetensors"
     path.write_bytes(changed_tensors(path, rng))
-    return (
-        path.read_bytes(), lambda: play("dptse/ShortHighway-v0", {"corridor": str(road)}), path
-    )  # fmt: skip
+    return path, lambda: play("dptse/ShortHighway-v0", {"corridor": str(road)})
 
 
 def fcd(points):
@@ -317,11 +318,7 @@ def trajectories(rng, folder):
     }.get(kind, table.read_bytes)()
     text = changed(text, rng)
     path.write_bytes(gzip.compress(text) if kind == "csv.gz" else text)
-    return (
-        path.read_bytes(),
-        lambda: import_trajectories([path], source, STRAIGHT, folder / "new", SPLITS),
-        path,
-    )
+    return path, lambda: import_trajectories([path], source, STRAIGHT, folder / "new", SPLITS)
 
 
 def fields(rng, folder):
@@ -333,11 +330,8 @@ def fields(rng, folder):
     path.write_bytes(changed(path.read_bytes(), rng))
     source = FieldSource(density, cell=0.05, interval=5.0, speed=speed)
     road = FieldRoad(segments=2, lanes=3, speed_limit=100.0)
-    return (
-        path.read_bytes(),
-        lambda: import_field(source, road, folder / "new", SPLITS, 40),
-        folder,  # of two files that do not fit one another either may be named
-    )
+    # Of two files that do not fit one another either may be named.
+    return path, lambda: import_field(source, road, folder / "new", SPLITS, 40), folder
 
 
 SOURCE = """
@@ -373,8 +367,8 @@ def cards(rng, folder):
             path.write_text(SOURCE)
     path.write_bytes(changed(path.read_bytes(), rng))
     if kind == "source":
-        return path.read_bytes(), lambda: read_source(path), path
-    return path.read_bytes(), lambda: play("dptse/ShortHighway-v0", keywords), path
+        return path, lambda: read_source(path)
+    return path, lambda: play("dptse/ShortHighway-v0", keywords)
 
 
 @cache
@@ -401,7 +395,7 @@ def networks(rng, folder):
         files = read_configuration(folder / "town.sumocfg")
         import_road(files, segment_path(files, PATH, 100.0), "motorway", 30)
 
-    return path.read_bytes(), use, folder  # what one file lacks another may be blamed for
+    return path, use, folder  # what one file lacks another may be blamed for
 
 
 FILES = {
@@ -462,9 +456,10 @@ def try_case(seed, kind, number):
     for _ in range(2):  # kernels were compiled the first time, perhaps
         rng = np.random.default_rng([seed, [*KINDS].index(kind), number])
         with tempfile.TemporaryDirectory(prefix="dptse-fuzz-") as name:
-            drawn, use, place = KINDS[kind](rng, folder := Path(name))
+            drawn, use, *place = KINDS[kind](rng, folder := Path(name))
             before = {*folder.rglob("*")}
-            said = verdict(use, place)
+            said = verdict(use, *place or [drawn])
+            drawn = drawn.read_bytes() if isinstance(drawn, Path) else drawn
             left = {*folder.rglob("*")} - before
         if left and said.startswith("refused"):
             said = f"escaped: it left {min(left)}, {said:.200}"

@@ -79,8 +79,7 @@ def first_file(imported):
 def driven(record, corridor, period=0.5):
     """Return points as `stream`, and the record column of each, of the vehicles of a record.
 
-    They drive from where they enter at the speeds of the record. Positions on ramps are those of
-    the face that they join or leave, minus or plus the distance to it, as the importers have them.
+    Positions on ramps are those of the face that they join or leave, minus or plus the distance.
     """
     starts = Branches(corridor).column_starts[1]
     points = []

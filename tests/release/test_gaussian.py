@@ -132,14 +132,9 @@ def test_a_vehicle_counts_alike_on_every_segment_in_units_of_the_noise(preset):
 
 
 def squared_distance(release, queries, std=None):
-    """Squared distance of two worlds' true values in units of the noise, over all seconds.
+    """Squared distance of two worlds' true values in units of the noise, or of ``std`` (2,).
 
-    Both worlds are queried alike, as they are given equal past releases.
-
-    Args:
-        release: A release model of two episodes.
-        queries: Observed columns of each second, (seconds, C).
-        std: Standard deviations (2,), of densities and flows or speeds; None for those in force.
+    Both are asked alike in each second, (seconds, C), as they are given equal past releases.
     """
     std = release.added_std[0] if std is None else std
     release.reset(BOTH, streams(1, 2))

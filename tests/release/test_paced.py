@@ -2,9 +2,7 @@
 
 No two trips are told apart by more than mu under ledgers, whatever is public. That holds surely and
 is tested without noise: for any queries, prices and centres, two records that differ in one vehicle
-have sums that are never further apart than mu, in units of the noise. Ways of getting it wrong are
-mutants (``tests/mutants.py``); those that look where they must not are in
-``tests/test_non_interference.py``.
+have sums that are never further apart than mu, in units of the noise.
 """
 
 import numpy as np

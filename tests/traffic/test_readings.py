@@ -50,11 +50,9 @@ def read(road, made):
 
 
 def detected(corridor, monkeypatch, seed=0):
-    """A record, and the loops that SUMO has seen meanwhile.
+    """A record, and what SUMO's loops have seen: sums of vehicles (K, F), and each passage.
 
-    Returns:
-        Record; sums of vehicles (K, F) of loops by interval; and what each vehicle did at each
-        station, by (station, vehicle): (interval, speed) of each time that its front came to one.
+    Passages are lists of (interval, speed) by (station, vehicle).
     """
     n, edges = corridor.geometry.n_mainline, sumo.edge_ids(corridor.geometry)
     places = [(edges[f] if f < n else "downstream", 0.0001) for f in range(n + 1)]

@@ -55,8 +55,8 @@ FLOWS = """
 </routes>"""
 
 
-def netconvert(folder: Path, nodes=NODES, edges=EDGES, connections=CONNECTIONS) -> Path:
-    """Compile plain XML; return the net file."""
+def netconvert(folder: Path, edges="", connections="", nodes=NODES) -> Path:
+    """Compile the motorway with more edges and connections; return the net file."""
     if importlib.util.find_spec("sumo") is None:
         pytest.skip("eclipse-sumo (extra corridors) is missing")
     import sumo
@@ -64,8 +64,8 @@ def netconvert(folder: Path, nodes=NODES, edges=EDGES, connections=CONNECTIONS) 
     command = [str(Path(sumo.__file__).parent / "bin" / "netconvert"), "--xml-validation=never"]
     for option, name, text in (
         ("-n", "nod.xml", nodes),
-        ("-e", "edg.xml", edges),
-        ("-x", "con.xml", connections),
+        ("-e", "edg.xml", EDGES.replace("</edges>", f"{edges}</edges>")),
+        ("-x", "con.xml", CONNECTIONS.replace("</connections>", f"{connections}</connections>")),
     ):
         (folder / name).write_text(text)
         command += [option, str(folder / name)]

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 import pytest
 
 from dptse_env.importers.sumo_net import Files, segment_path
-from tests.importers.sumo_net.conftest import CONNECTIONS, EDGES, NODES, PATH, netconvert
+from tests.importers.sumo_net.conftest import NODES, PATH, netconvert
 
 
 def lengths_of_edges(net):
@@ -67,14 +67,12 @@ def test_ramps_lie_at_faces_and_acceleration_lanes_count_as_lanes_of_the_mainlin
 
 
 def test_roads_that_meet_at_one_junction_are_one_ramp(tmp_path):
-    edges = EDGES.replace(
-        "</edges>", '<edge id="second" from="alone" to="n1" numLanes="1" speed="20"/></edges>'
+    net = netconvert(
+        tmp_path,
+        '<edge id="second" from="alone" to="n1" numLanes="1" speed="20"/>',
+        '<connection from="second" to="merge" fromLane="0" toLane="2"/>',
     )
-    connections = CONNECTIONS.replace(
-        "</connections>",
-        '<connection from="second" to="merge" fromLane="0" toLane="2"/></connections>',
-    )
-    segments = segment_path(Files(netconvert(tmp_path, NODES, edges, connections), ()), PATH, 100.0)
+    segments = segment_path(Files(net, ()), PATH, 100.0)
     assert segments.names[0] == "ramp-b + second"
     assert segments.geometry.ramp_lanes == (2, 1)
     columns = segments.columns[segments.geometry.n_mainline]
@@ -82,17 +80,13 @@ def test_roads_that_meet_at_one_junction_are_one_ramp(tmp_path):
 
 
 def test_a_lay_by_is_an_off_ramp_and_an_on_ramp_on_either_half(tmp_path):
-    edges = EDGES.replace(
-        "</edges>",
+    net = netconvert(
+        tmp_path,
         '<edge id="lay-by" from="n2" to="n3" numLanes="1" speed="20" '
-        'shape="650,0 700,-30 950,-30 1000,0"/></edges>',
-    )
-    connections = CONNECTIONS.replace(
-        "</connections>",
+        'shape="650,0 700,-30 950,-30 1000,0"/>',
         '<connection from="merge" to="lay-by" fromLane="0" toLane="0"/>'
-        '<connection from="lay-by" to="bend" fromLane="0" toLane="0"/></connections>',
+        '<connection from="lay-by" to="bend" fromLane="0" toLane="0"/>',
     )
-    net = netconvert(tmp_path, NODES, edges, connections)
     segments = segment_path(Files(net, ()), PATH, 100.0)
     assert segments.names == ("ramp-b", "lay-by", "lay-by", "exit-a")
     N = segments.geometry.n_mainline
@@ -123,15 +117,13 @@ def test_paths_of_no_use_are_refused_in_one_line(files, path, options, message):
 
 
 def test_ramps_too_near_to_one_another_are_refused_by_name(tmp_path):
-    nodes = NODES.replace('<node id="n2" x="650" y="0"/>', '<node id="n2" x="425" y="0"/>')
-    edges = EDGES.replace(
-        "</edges>", '<edge id="off" from="n2" to="r0" numLanes="1" speed="20"/></edges>'
+    net = netconvert(
+        tmp_path,
+        '<edge id="off" from="n2" to="r0" numLanes="1" speed="20"/>',
+        '<connection from="merge" to="off" fromLane="0" toLane="0"/>',
+        NODES.replace('<node id="n2" x="650" y="0"/>', '<node id="n2" x="425" y="0"/>'),
     )
-    connections = CONNECTIONS.replace(
-        "</connections>",
-        '<connection from="merge" to="off" fromLane="0" toLane="0"/></connections>',
-    )
-    found = Files(netconvert(tmp_path, nodes, edges, connections), ())
+    found = Files(net, ())
     with pytest.raises(
         ValueError, match=r'on-ramp ramp-b and off-ramp off are \d+ m apart; .* --leave-out="off"$'
     ):
