@@ -277,11 +277,28 @@ def test_sensors_that_are_off_beside_others_are_gaps(cells, kind, tmp_path):
         assert flow.min() > 500.0
 
 
-def test_a_flow_of_zero_beside_vehicles_is_told_where_others_pass(tmp_path):
-    density, speed = traffic()
-    speed[4, 30:42] = 0.0
-    with pytest.warns(UserWarning, match=r"column\(s\) 31\.\.42, .*speed\.txt is 0 where vehicles"):
-        save(tmp_path, density=density, speed=speed).read(3, 100.0)
+@pytest.mark.parametrize(
+    ("kind", "place", "number", "message"),
+    [
+        ("density", np.s_[3, 7], 9999, r"density\.txt: row 4, column 8 must be .*, got 9999$"),
+        ("speed", np.s_[3, 7], 999, r"speed\.txt: row 4, column 8 must be .*, got 999$"),
+        (
+            "speed",
+            np.s_[3:6, 7],
+            255,
+            r"3 values are 255 km/h, .*: let them be nan if",
+        ),
+        ("speed", np.s_[4, 30:42], 0, r"column\(s\) 31\.\.42, .*speed\.txt is 0 where vehicles"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_numbers_that_no_road_can_have_are_refused_and_doubtful_ones_told(
+    kind, place, number, message, tmp_path
+):
+    tables = dict(zip(("density", "speed"), traffic(), strict=True))
+    tables[kind][place] = number
+    with pytest.raises((ValueError, UserWarning), match=message):
+        save(tmp_path, **tables).read(3, 100.0)
 
 
 def test_a_ramp_may_feed_a_road_that_is_empty_upstream(tmp_path):
@@ -290,23 +307,6 @@ def test_a_ramp_may_feed_a_road_that_is_empty_upstream(tmp_path):
     density[4:, 20:50], speed[4:, 20:50] = 15.0, 60.0  # 37 vehicles
     found = save(tmp_path, density=density, speed=speed).read(3, 100.0)[0]
     np.testing.assert_allclose(found, density, rtol=1e-5)
-
-
-@pytest.mark.parametrize(("kind", "number"), [("density", 9999), ("speed", 999)])
-def test_numbers_that_no_road_can_have_are_refused(kind, number, tmp_path):
-    tables = dict(zip(("density", "speed"), traffic(), strict=True))
-    tables[kind][3, 7] = number
-    message = rf"{kind}\.txt: row 4, column 8 must be .*, got {number}$"
-    with pytest.raises(ValueError, match=message):
-        save(tmp_path, **tables).read(3, 100.0)
-
-
-def test_a_number_far_above_others_that_comes_again_is_told(tmp_path):
-    density, speed = traffic()
-    speed[3:6, 7] = 255.0
-    message = r"speed\.txt: 3 values are 255 km/h, and no other is above [\d.]+: let them be nan if"
-    with pytest.warns(UserWarning, match=message):
-        save(tmp_path, density=density, speed=speed).read(3, 100.0)
 
 
 @pytest.mark.parametrize(

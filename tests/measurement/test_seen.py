@@ -23,6 +23,7 @@ def test_the_deviation_of_probes_falls_with_their_number():
     said = probes(0.0, 0.2, 80.0, vehicles=9, seconds=60)
     assert (said.density, said.density_std) == (None, None)
     assert said.speed_std == pytest.approx(12.0 / math.sqrt(9))
+    assert probes(0.0, 0.2, 80.0, vehicles=4, seconds=60, spread=0.5).speed_std == 0.25
 
 
 READINGS = [
