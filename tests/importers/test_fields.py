@@ -282,12 +282,7 @@ def test_sensors_that_are_off_beside_others_are_gaps(cells, kind, tmp_path):
     [
         ("density", np.s_[3, 7], 9999, r"density\.txt: row 4, column 8 must be .*, got 9999$"),
         ("speed", np.s_[3, 7], 999, r"speed\.txt: row 4, column 8 must be .*, got 999$"),
-        (
-            "speed",
-            np.s_[3:6, 7],
-            255,
-            r"3 values are 255 km/h, .*: let them be nan if",
-        ),
+        ("speed", np.s_[3:6, 7], 255, r"3 values are 255 km/h, .*: let them be nan if"),
         ("speed", np.s_[4, 30:42], 0, r"column\(s\) 31\.\.42, .*speed\.txt is 0 where vehicles"),
     ],
 )

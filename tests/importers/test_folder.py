@@ -8,8 +8,6 @@ import pytest
 
 from dptse_env.importers import Layout, Source, Strip
 from dptse_env.importers.folder import assign_seeds, new_folder
-from dptse_env.importers.road_file import write_road
-from dptse_env.traffic import PAPER_HIGHWAY, Demand, read_corridor
 from tests.importers.data import PLAIN, ROAD, SPLITS, plain, run, stream
 
 
@@ -22,19 +20,6 @@ def test_several_files_are_several_recordings(tmp_path):
         "training": 4, "validation": 1, "test": 1
     }  # fmt: skip
     assert imported.corridor.measured == ("demand", "exit_shares", "average_dwell")
-
-
-def test_the_road_file_has_an_array_in_few_lines(tmp_path):
-    path, rates = tmp_path / "road.toml", tuple((30.0 * k, 1000.0 + k) for k in range(40))
-    road = PAPER_HIGHWAY.replaced(
-        demand=Demand(rates, (100.0,) * len(PAPER_HIGHWAY.geometry.on_ramps))
-    )
-    write_road(path, road, {"query_spans": [1, 2]}, "a comment")
-    lines = path.read_text(encoding="utf-8").splitlines()
-    assert len(lines) < 60
-    assert 80 < max(map(len, lines)) <= 100
-    assert "query_spans = [1, 2]" in lines
-    assert read_corridor(path) == road
 
 
 def test_every_split_has_a_window_if_it_can():

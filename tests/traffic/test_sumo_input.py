@@ -13,7 +13,6 @@ from dptse_env.traffic.sumo_input import (
     net_xml,
     packaged_net,
 )
-from dptse_env.utils.registry import MissingExtraError
 from tests.helpers import UNEVEN
 
 needs_netconvert = pytest.mark.skipif(
@@ -31,17 +30,6 @@ def test_a_preset_is_not_compiled(monkeypatch):
     monkeypatch.setattr("dptse_env.traffic.sumo_input.compile_net", None)
     changed = PAPER_HIGHWAY.replaced(name="mine", incident=None, duration=60)
     assert net_xml(changed.geometry) == packaged_net("paper-highway")
-
-
-def test_a_missing_netconvert_names_the_extra(monkeypatch):
-    found = importlib.util.find_spec
-
-    def without_sumo(name, *rest):
-        return None if name == "sumo" else found(name, *rest)
-
-    monkeypatch.setattr(importlib.util, "find_spec", without_sumo)
-    with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[corridors\]'"):
-        compile_net(PAPER_HIGHWAY.replaced(n_mainline=21).geometry)
 
 
 @needs_netconvert
