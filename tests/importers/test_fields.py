@@ -179,22 +179,6 @@ def test_speeds_in_metres_a_second_are_told_in_light_traffic_alone(tmp_path):
         source.read(4, 110.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "odd", "message"),
-    [("speed", 330.0, "likely none that is known"), ("density", 984.0, "likely veh/mi")],
-)
-def test_a_few_cells_may_be_odd(name, odd, message, tmp_path):
-    source, table = write(tmp_path), np.full((10, 90), 66.0)
-    source = dataclasses.replace(source, **{f"{name}_unit": None})
-    table.flat[:9] = odd  # 1 % of the cells
-    np.savetxt(tmp_path / f"{name}.txt", table)
-    assert source.read(4, 110.0)[0].shape == (10, 90)
-    table.flat[:10] = odd
-    np.savetxt(tmp_path / f"{name}.txt", table)
-    with pytest.raises(ValueError, match=rf"{name}\.txt: {name}_unit must fit .*{message}"):
-        source.read(4, 110.0)
-
-
 def test_short_gaps_are_filled_and_told_and_long_ones_refused(tmp_path):
     source = write(tmp_path)
     density, flow = source.read(4, 110.0)
@@ -362,12 +346,6 @@ def test_a_field_may_have_long_intervals(interval, tmp_path):
     """Longer than what is looked at to tell its order."""
     density, _ = write(tmp_path, interval=interval).read(4, 110.0)
     assert density.shape == (10, 90)
-
-
-def test_a_field_that_is_too_short_may_be_transposed(tmp_path):
-    source = save(tmp_path, density=np.full((60, 12), 60.0), speed=np.full((60, 12), 80.0))
-    with pytest.raises(ValueError, match=r"below the field's 60 s, or transposed given, got 100"):
-        import_field(source, ROAD, tmp_path / "road", SPLITS, 100)
 
 
 def test_a_folder_is_never_replaced(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.estimators import ESTIMATORS, Estimate, Estimator, Measurement
+from dptse_env.estimators import ESTIMATORS, Estimator, Measurement
 from dptse_env.measurement.loops import seconds_told
 from dptse_env.process import QueryProcess
 from tests.helpers import COUNTED, PAID, SHORT, fast_and_slow, lock_step, make_batch
@@ -144,20 +144,6 @@ def test_a_reading_is_of_the_mean_and_leaves_an_estimate_its_course():
     np.testing.assert_allclose(empty[..., :2], np.tile(said[..., :2], (3, 1, 1, 1)))
 
 
-def test_readings_come_at_the_ends_of_intervals_alone():
-    """In between, an estimate depends on nothing that an interval will report."""
-    with_loops, without = begun(privacy="printed"), begun(privacy="printed", loops=None)
-    differs = []
-    for action in sampled(with_loops, 15):
-        for process in (with_loops, without):
-            process.step(ALL, action)
-        same = with_loops.estimate.density == without.estimate.density
-        differs.append(~same.all(axis=1))
-    first = np.argmax(differs, axis=0)
-    begun_at = np.array(STARTS["start"]) % T  # who begins later than T / 2 is not told of it
-    np.testing.assert_array_equal(first, T - 1 - begun_at + T * (begun_at > T // 2))
-
-
 # --- what rules and reports see -------------------------------------------------------------------
 
 
@@ -281,72 +267,28 @@ def test_a_copy_that_is_stepped_like_its_origin_gives_the_same_bits(copied, esti
     assert not np.array_equal(other.estimate.density, origin.estimate.density)
 
 
-# --- estimators of other packages, and those that cannot go back ----------------------------------
+# --- estimators that cannot go back ---------------------------------------------------------------
 
 
-class Held(Estimator):
-    """The last release of each segment by itself, held until the next one."""
+class Forgetful(ESTIMATORS.find("random_walk")):
+    """One that does not say what it remembers."""
 
-    def __init__(self, model, n_episodes, settings):
-        super().__init__(model, n_episodes, settings)
-        self.held = np.full((n_episodes, model.n_segments, 2), 50.0)
-
-    def _reset(self, episodes, states, generators):
-        self.held[episodes] = 50.0
-
-    def _predict(self, episodes, inputs):
-        self.held[episodes, :, 0] += 0.1
-
-    def _update(self, episodes, measured):
-        observed, values = measured.observed[:, : self.held.shape[1]], measured.values
-        read = np.where(observed[..., None], values[:, : self.held.shape[1]], self.held[episodes])
-        self.held[episodes] = read
-
-    def _estimate(self):
-        density, speed = self.held[..., 0].copy(), self.held[..., 1].copy()
-        return Estimate(density, speed, np.full_like(density, 20.0), np.full_like(speed, 10.0))
+    _memory = Estimator._memory
 
 
-class Remembering(Held):
-    """One whose episodes can go back."""
-
-    @property
-    def _memory(self):
-        return (self.held,)
-
-
-class Copying(Held):
+class Copying(ESTIMATORS.find("random_walk")):
     """One that hands out what nothing can be written back to."""
 
     @property
     def _memory(self):
-        return (self.held.copy(),)
-
-
-def test_an_estimator_of_another_package_goes_back_by_what_it_remembers():
-    process = begun(estimator=Remembering, privacy="printed")
-    nothing = np.zeros((4, 6), dtype=np.int8)
-    for _ in range(T - 1):
-        process.step(ALL, nothing)
-    before = process.estimate.density[0].copy()
-    process.step(ALL, nothing)
-    fixed = list(process.config.corridor.fixed_sensors)
-    beside = np.unique(process.config.corridor.stations.beside)
-    said = process.loops.said(process.traffic.readings[process.traffic_index[:1], [0]])
-    unseen = np.setdiff1d(np.arange(8), [*beside, *fixed])
-    np.testing.assert_allclose(process.estimate.density[0, unseen], before[unseen] + 0.1)
-    known = np.isfinite(said.density[0]) & ~np.isin(beside, fixed)
-    assert known.any()
-    read = process.estimate.density[0, beside[known]]
-    since = 0.1 * (T - 1 - seconds_told(T)[-1])
-    np.testing.assert_allclose(read, said.density[0, known] + since)
+        return tuple(each.copy() for each in super()._memory)
 
 
 @pytest.mark.parametrize("make", [partial(gym.make, SHORT), make_batch])
 def test_an_estimator_that_cannot_go_back_is_refused_before_anything_is_recorded(make):
-    with pytest.raises(ValueError, match=r"^estimator must be .* got .*Held"):
-        make(estimator=Held, loops=LOOPS)
-    make(estimator=Held)
+    with pytest.raises(ValueError, match=r"^estimator must be .* got .*Forgetful"):
+        make(estimator=Forgetful, loops=LOOPS)
+    make(estimator=Forgetful)
     with pytest.raises(ValueError, match=r"^estimator must return .* got .*Copying"):
         make(estimator=Copying, loops=LOOPS).reset(seed=0)
     with pytest.raises(ValueError, match=r"^backend must be 'compiled' .* got 'reference'"):

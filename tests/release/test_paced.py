@@ -142,13 +142,6 @@ def test_without_a_finite_prediction_centres_fall_back_and_releases_go_on(bad, q
     assert [*told, release.public(ONE)["centre_fallback"][0]] == [0.0, 1.0, 0.0, 1.0, 0.0]
 
 
-def test_a_fall_back_is_told_of_its_own_episode():
-    speed = np.array([[np.nan], [40.0]])
-    two = started(Worlds(crowd(), crowd()))
-    two.release(request(1, prediction=predicting(20.0, speed, 2), episodes=BOTH))
-    assert two.public(BOTH)["centre_fallback"].tolist() == [1.0, 0.0]
-
-
 def test_a_price_buys_noise_of_its_deviation_and_one_whose_noise_is_not_exact_is_refused():
     release, prices = started(), np.full((1, COLUMNS), 0.04)
     release.pacing.prices = lambda *args: prices

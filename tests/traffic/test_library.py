@@ -61,22 +61,6 @@ def test_a_record_is_made_once_and_then_read(tmp_path, short_record, monkeypatch
     assert records.get(SHORT_HIGHWAY, np.int64(0)) is record
 
 
-def test_a_recording_that_takes_long_is_announced_once_for_a_road(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(library, "record_seeds", lambda *_: None)
-    monkeypatch.setattr(library, "_said", set())
-    records = RecordLibrary(tmp_path)
-    for seeds, workers, progress, n_said in (
-        (range(20), 1, True, 0),  # shown by a bar
-        (range(20), 20, False, 0),  # quick
-        (range(40), 1, False, 1),
-        (range(40), 1, False, 1),
-    ):
-        with caplog.at_level(logging.WARNING, logger="dptse_env"):
-            records.ensure(SHORT_HIGHWAY, seeds, workers, progress)
-        assert len(caplog.messages) == n_said
-    assert "short-highway with SUMO, once for each traffic seed: 4 s or more" in caplog.text
-
-
 def test_the_records_read_last_are_kept_in_memory(tmp_path):
     for seed in range(3):
         tiny_record(tmp_path, seed)

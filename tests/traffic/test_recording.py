@@ -15,7 +15,6 @@ from dptse_env.traffic import (
     RecordingError,
     RecordLibrary,
     simulate,
-    simulate_in_worker,
 )
 from dptse_env.traffic.recording import record_seeds
 from tests.helpers import ROOT, wait_for
@@ -185,13 +184,3 @@ def test_a_script_without_a_main_guard_and_one_from_a_pipe_work(tmp_path, short_
             check=False,
         )
         assert result.stdout.strip() == str(short_record.n_rows), result.stderr
-
-
-@pytest.mark.slow
-def test_modules_in_the_working_directory_do_not_shadow_those_of_a_worker(
-    tmp_path, monkeypatch, short_record
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "queue.py").write_text("raise RuntimeError('shadowed')")
-    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
-    assert_same(simulate_in_worker(SHORT_HIGHWAY, 0), short_record)
