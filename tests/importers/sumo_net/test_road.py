@@ -231,6 +231,15 @@ def test_a_warm_up_starts_the_record_with_traffic(files, road):
     np.testing.assert_array_equal(warm.record.counts[0], road.record.counts[120])
 
 
+def test_an_incident_makes_no_vehicle_faster(files, road, tmp_path):
+    slow = tmp_path / "slow.rou.xml"
+    slow.write_text(FLOWS.replace('id="car"', 'id="car" maxSpeed="10"'))
+    digests = file_digest(files.net), file_digest(slow)
+    sumo = dataclasses.replace(road.corridor.sumo, routes=(str(slow),), sha256=digests)
+    limited = road.corridor.replaced(sumo=sumo, incident=Incident(2, ((30, 200, 90.0),)))
+    assert 30.0 < simulate(limited, 0).speed.max() <= 36.01
+
+
 def test_a_road_file_moves_with_its_files_which_are_told_by_their_content(road, files, tmp_path):
     folder, there = tmp_path / "here", tmp_path / "there"
     folder.mkdir()
@@ -339,6 +348,21 @@ def test_options_of_the_traffic_are_told_from_all_others():
 
 def taken(option):
     return TRAFFIC.fullmatch(option) is not None
+
+
+def test_flows_of_intervals_depart_in_order_among_vehicles(tmp_path):
+    def at(begin, flow):
+        return f'<interval begin="{begin}" end="300">{flow}</interval>'
+
+    own, plain = '<flow begin="70"/>', "<flow/>"
+    vehicle, route = '<vehicle depart="99"/>', "<route/>"
+    given, copy = tmp_path / "given.xml", tmp_path / "copy.xml"
+    given.write_text(
+        f"<all>{at('0:02:30', plain + own)}{at(50, plain)}{vehicle}{plain}{route}</all>"
+    )
+    assert not copy_input(given, copy, 60.0).is_sorted
+    in_order = [route, at(50, plain), plain, at("0:02:30", own), vehicle, at("0:02:30", plain)]
+    assert canonicalize(copy.read_text()) == canonicalize(f"<all>{''.join(in_order)}</all>")
 
 
 @pytest.mark.parametrize("place", ["{root}/kept.xml", "{root}/missing/new.xml", "kept.xml"])
