@@ -115,6 +115,7 @@ def test_a_name_is_looked_for_among_installed_packages(monkeypatch):
     monkeypatch.setattr(registry, "entry_points", lambda group: [entry][: group == entry.group])
     monkeypatch.setattr(registry, "_plugins_loaded", False)
     assert ESTIMATORS.find("plugin-estimator") is parts.Smoothed
+    assert registry._plugins_loaded  # once a process
 
 
 class Duck:
