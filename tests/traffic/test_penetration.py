@@ -6,23 +6,20 @@ import numpy as np
 import pytest
 
 from dptse_env.config import resolve
-from dptse_env.traffic import Penetration, Record
+from dptse_env.traffic import Penetration
+from tests.helpers import record
 
 SHARES = (0.01, 0.1, 0.3, 0.9, 1.0)
 
 
-def road_of(n_vehicles, n_steps=4):
-    """A record in which every vehicle stands on segment 0 in every second."""
-    step, vehicle = (grid.ravel() for grid in np.indices((n_steps, n_vehicles)))
-    speed = 10.0 + vehicle
-    return Record(
-        step=step, vehicle=vehicle, segment=np.zeros_like(step), speed=speed,
-        n_steps=n_steps, n_columns=3,
-    )  # fmt: skip
+def road_of(n_vehicles):
+    """A record of one second, in which every vehicle is on segment 0."""
+    places = np.zeros((n_vehicles, 1), dtype=int)
+    return record(places, 10.0 + np.arange(n_vehicles)[:, None], n_columns=3)
 
 
 def test_connected_vehicles_at_a_share_are_connected_at_every_larger_one():
-    sets = [Penetration(share).connected(7, road_of(5_000, 1)) for share in SHARES]
+    sets = [Penetration(share).connected(7, road_of(5_000)) for share in SHARES]
     for smaller, larger in itertools.pairwise(sets):
         assert not (smaller & ~larger).any()
     assert sets[-1].all()
@@ -32,7 +29,7 @@ def test_connected_vehicles_at_a_share_are_connected_at_every_larger_one():
 
 def test_a_vehicle_is_connected_by_its_seeds_and_number_alone():
     def connected(seed=0, traffic_seed=7, n=1_000):
-        return Penetration(0.5, seed=seed).connected(traffic_seed, road_of(n, 1))
+        return Penetration(0.5, seed=seed).connected(traffic_seed, road_of(n))
 
     np.testing.assert_array_equal(connected(n=10), connected()[:10])
     for change in ({"seed": 1}, {"traffic_seed": 8}):
@@ -48,24 +45,24 @@ def test_a_share_of_a_range_is_drawn_for_each_traffic_seed():
     assert len(set(shares.tolist())) == 200
     assert shares[3] == penetration.share_of(3)
     assert penetration.published_share == pytest.approx(0.25)
-    connected = [penetration.connected(seed, road_of(4_000, 1)).mean() for seed in range(5)]
+    connected = [penetration.connected(seed, road_of(4_000)).mean() for seed in range(5)]
     np.testing.assert_allclose(connected, shares[:5], atol=0.03)
 
 
 def test_the_connected_vehicles_report_and_some_misreport_their_speed():
-    record = road_of(2_000, n_steps=1)
+    whole = road_of(2_000)
     penetration = Penetration(0.5, misreporting=0.25, misreport_factor=2.0)
-    speeds = penetration.speeds(7, record)
+    speeds = penetration.speeds(7, whole)
     reported = np.flatnonzero(speeds >= 0.0)
     np.testing.assert_array_equal(
-        record.vehicle[reported], np.flatnonzero(penetration.connected(7, record))
+        whole.vehicle[reported], np.flatnonzero(penetration.connected(7, whole))
     )
-    assert (speeds == -1.0).sum() == record.n_rows - reported.size
-    factor = speeds[reported] / (10.0 + record.vehicle[reported])
+    assert (speeds == -1.0).sum() == whole.n_rows - reported.size
+    factor = speeds[reported] / (10.0 + whole.vehicle[reported])
     assert set(np.round(factor, 3).tolist()) == {1.0, 2.0}
     assert abs((factor > 1.5).mean() - 0.25) < 0.06
     half = Penetration(misreporting=0.5, misreport_factor=2.0)
-    wrong = [half.speeds(seed, record) > record.speed for seed in (7, 8)]
+    wrong = [half.speeds(seed, whole) > whole.speed for seed in (7, 8)]
     assert 0.4 < (wrong[0] == wrong[1]).mean() < 0.6
 
 
