@@ -118,13 +118,6 @@ def test_a_name_is_looked_for_among_installed_packages(monkeypatch):
     assert registry._plugins_loaded  # once a process
 
 
-class Duck:
-    def reset(self): ...
-    def predict(self): ...
-    def update(self): ...
-    def estimate(self): ...
-
-
 class NoUpdate(Estimator):
     def _reset(self): ...
     def _predict(self): ...
@@ -169,11 +162,12 @@ def scalar_reward(second):
 
 
 HERE = __name__
+LAPLACE = by_module("privacy")
 UNKNOWN = {"estimator": parts.Smoothed, "estimator_settings": {"gain": 1}}
 BAD = [
     ("make", {"estimator": "no_module:Filter"}, "estimator .* cannot be imported: ModuleNotFoundE"),
     ("make", {"estimator": f"{HERE}:Missing"}, f"estimator .* {HERE} has no 'Missing'; .*py"),
-    ("make", {"estimator": Duck}, r"estimator .*:Duck must be a subclass of dptse_env\.estimators"),
+    ("make", {"estimator": LAPLACE}, r"estimator .* must be a subclass of dptse_env\.estimators"),
     ("make", {"estimator": NoUpdate}, r"estimator .*:NoUpdate must have _update\(\)"),
     ("make", {"privacy": NoUpdate}, r"privacy\.preset .*:NoUpdate must be a subclass of"),
     ("make", {"observation": ["default", Clash]}, "observation .*:Clash must not be named 'age'"),
