@@ -22,19 +22,22 @@ SPLITS = [
 ROAD = FieldRoad(segments=3, lanes=4, speed_limit=110.0)
 
 
-def write(folder, cells=10, intervals=90, **changes):
+def save(folder, delimiter=" ", **tables):
+    """Write tables, and return the field of them."""
+    for name, table in tables.items():
+        np.savetxt(folder / f"{name}.txt", table, delimiter=delimiter, fmt="%.17g")
+    paths = {name: folder / f"{name}.txt" for name in tables}
+    return FieldSource(**paths, cell=0.1, interval=5.0, delimiter=delimiter.strip() or None)
+
+
+def write(folder, **changes):
     """A field in veh/ft and ft/s that grows along the road and over time."""
-    along, times = np.arange(cells)[:, None], np.arange(intervals)[None]
+    along, times = np.arange(10.0)[:, None], np.arange(90.0)[None]
     density = 0.01 * (1.0 + 0.1 * along + 0.01 * times)
     speed = 60.0 * (1.0 + 0.02 * along + 0.0 * times)
-    np.savetxt(folder / "density.txt", density)
-    np.savetxt(folder / "speed.txt", speed)
-    np.savetxt(folder / "flow.txt", density * speed)
-    fields = {
-        "density": folder / "density.txt", "speed": folder / "speed.txt", "cell": 0.05,
-        "interval": 5.0, "density_unit": "veh/ft", "speed_unit": "ft/s",
-    }  # fmt: skip
-    return FieldSource(**{**fields, **changes})
+    source = save(folder, density=density, speed=speed, flow=density * speed)
+    units = {"cell": 0.05, "density_unit": "veh/ft", "speed_unit": "ft/s", "flow": None}
+    return dataclasses.replace(source, **units | changes)
 
 
 def test_a_field_becomes_a_road_with_records_of_its_own(tmp_path):
@@ -218,14 +221,6 @@ def traffic(cells=12, intervals=60):
     waves = sum(np.sin(400.0 * u * (time + place / 18.0) + 7.0 * p) for u, p in rng.random((8, 2)))
     density = 180.0 + 12.0 * waves
     return density, 18.0 * (450.0 / density - 1.0)
-
-
-def save(folder, delimiter=" ", **tables):
-    """Write tables, and return the field of them."""
-    for name, table in tables.items():
-        np.savetxt(folder / f"{name}.txt", table, delimiter=delimiter, fmt="%.6g")
-    paths = {name: folder / f"{name}.txt" for name in tables}
-    return FieldSource(**paths, cell=0.1, interval=5.0, delimiter=delimiter.strip() or None)
 
 
 def test_zeros_while_sensors_were_off_are_gaps(tmp_path):
