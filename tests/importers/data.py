@@ -45,6 +45,7 @@ def stream(seconds=120.0, period=0.1, headway=4.0, speed=20.0, length=400.0):
 def write_csv(path, columns, delimiter=",", head="", lines=()):
     """Write a table of texts and numbers; extra lines come last."""
     names = list(columns)
+    path.parent.mkdir(exist_ok=True)
     rows = zip(*(columns[name] for name in names), strict=True)
     text = [delimiter.join(names), *(delimiter.join(map(str, row)) for row in rows), *lines]
     path.write_text(head + "\n".join(text) + "\n", encoding="utf-8")

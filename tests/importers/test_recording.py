@@ -30,11 +30,6 @@ def assert_alike(imported, expected, seeds=(0, 1)):
         np.testing.assert_allclose(one.speed_sums, other.speed_sums)
 
 
-def subfolder(tmp_path, name):
-    (tmp_path / name).mkdir()
-    return tmp_path / name / "a.csv"
-
-
 def test_windows_follow_one_another_and_are_split_by_time(tmp_path):
     path = plain(tmp_path / "a.csv", stream(seconds=124.0))
     imported = run(path)
@@ -49,14 +44,14 @@ def test_windows_follow_one_another_and_are_split_by_time(tmp_path):
 @pytest.mark.parametrize("stray", [-1.0, 1e300])
 def test_a_wrong_time_is_counted_and_left_out(stray, tmp_path):
     points = stream() + np.array([0, 1000, 0, 0])
-    expected = run(plain(subfolder(tmp_path, "clean"), points))
+    expected = run(plain(tmp_path / "clean" / "a.csv", points))
     wrong = points[[500]] * [1, 0, 1, 1] + np.array([0, stray, 0, 0])
     # In the place of the first row, as well as amid the file; a header is row 1.
     for row, rows in (
         (2, [*wrong, *points]),
         (902, [*points[:900], *wrong, *points[900:]]),
     ):
-        path = plain(subfolder(tmp_path, str(row)), np.array(rows))
+        path = plain(tmp_path / str(row) / "a.csv", np.array(rows))
         time = re.escape(f"{stray:.6g}")
         message = rf"a\.csv, row {row}: the time {time} s is over 600 s from all windows: 1 such"
         with pytest.warns(UserWarning, match=message):
@@ -83,7 +78,7 @@ def test_a_silence_of_over_ten_minutes_begins_another_recording(tmp_path):
     later = points + np.array([100, 86_400, 0, 0])
     imported = run(plain(tmp_path / "a.csv", np.concatenate([points, later])), splits=ALL)
     assert starts(imported) == [0.0, 21.0, 86_400.0, 86_421.0]
-    alone = run(plain(subfolder(tmp_path, "alone"), points), splits=ALL)
+    alone = run(plain(tmp_path / "alone" / "a.csv", points), splits=ALL)
     assert_alike(imported, alone)
     for seed in (0, 1):
         vehicles = record_of(imported, 2 + seed).vehicle
@@ -150,7 +145,7 @@ ORDERS = {
 def test_rows_may_be_in_any_order_of_one_traffic(order, tmp_path):
     points = stream()
     expected = run(plain(tmp_path / "a.csv", points))
-    imported = run(plain(subfolder(tmp_path, "b"), ORDERS[order](points)))
+    imported = run(plain(tmp_path / "b" / "a.csv", ORDERS[order](points)))
     assert first_file(imported)["steps_back"] == (order == "halves")
     assert_alike(imported, expected)
 
@@ -179,7 +174,7 @@ def test_codes_that_are_one_number_are_one(text, tmp_path):
             PLAIN, columns={**PLAIN.columns, "lane": "lane", "group": "side"}, where={"site": 1},
             groups=(1,), layout=Layout(mainline=Strip(lanes=wanted)),
         )  # fmt: skip
-        path = plain(subfolder(tmp_path, name), points, lane=codes, side=codes, site=codes)
+        path = plain(tmp_path / name / "a.csv", points, lane=codes, side=codes, site=codes)
         counts.append(record_of(run(path, source)).counts)
     assert counts[0].any()
     np.testing.assert_array_equal(counts[0], counts[1])
@@ -211,7 +206,7 @@ def test_ramps_are_told_by_lanes_or_lateral_positions(tmp_path):
     }.items():
         layout = Layout(on_ramps=parts[:1], off_ramps=parts[1:2], mainline=parts[2])
         source = Source("table", {**PLAIN.columns, role: role}, layout=layout)
-        path = subfolder(tmp_path, role)
+        path = tmp_path / role / "a.csv"
         plain(path, points, lane=lane, y=np.where(lane == 1, 0.0, 5.0 * lane))
         imported = run(path, source, ROAD)
         counts.append(record_of(imported).counts)
@@ -232,7 +227,7 @@ def test_a_curved_road_is_straightened_by_its_centre_line(tmp_path):
     columns = {**PLAIN.columns, "x": "px", "y": "py"}
     source = Source("table", columns, layout=Layout(centre_line=tuple(line)))
     straight = run(plain(tmp_path / "a.csv", points))
-    assert_alike(run(plain(subfolder(tmp_path, "bent"), points, px=x, py=y), source), straight)
+    assert_alike(run(plain(tmp_path / "bent" / "a.csv", points, px=x, py=y), source), straight)
 
 
 def test_short_gaps_are_filled_and_longer_ones_and_jumps_cut(tmp_path):
@@ -274,7 +269,7 @@ def test_vehicles_that_share_an_id_at_one_time_are_told_apart(shuffled, tmp_path
     shared = np.concatenate([shared, shared[300:310]])
     if shuffled:
         shared = np.random.default_rng(0).permutation(shared)
-    imported = run(plain(subfolder(tmp_path, "shared"), shared))
+    imported = run(plain(tmp_path / "shared" / "a.csv", shared))
     file = first_file(imported)
     assert (file["vehicles"], file["ids_shared"], file["duplicates"]) == (4, 4, 10)
     assert (file["out_of_order"] > 100) == shuffled
@@ -294,7 +289,7 @@ def test_vehicles_that_share_an_id_may_have_times_that_alternate(tmp_path):
     expected = run(plain(tmp_path / "a.csv", points))
     shared = points.copy()
     shared[:, 0] //= 2
-    imported = run(plain(subfolder(tmp_path, "shared"), shared))
+    imported = run(plain(tmp_path / "shared" / "a.csv", shared))
     assert first_file(imported)["ids_shared"] == 8  # the last vehicle is alone
     assert_alike(imported, expected)
 
@@ -391,7 +386,7 @@ def test_what_is_in_memory_is_a_bucket_not_the_file(tmp_path, monkeypatch):
     points = stream()
     for size in (2 * len(points), len(points) // 4):
         monkeypatch.setattr(recording, "BUCKET_ROWS", size)
-        imported.append(run(plain(subfolder(tmp_path, str(size)), points)))
+        imported.append(run(plain(tmp_path / str(size) / "a.csv", points)))
     assert sizes[0] == sum(sizes[1:]) == len(points)
     assert max(sizes[1:]) < len(points) / 2
     at_once, in_buckets = (record_of(each).counts for each in imported)
