@@ -12,7 +12,6 @@ from dptse_env.traffic import RecordLibrary
 from tests.importers.data import PLAIN, ROAD, first_file, plain, run, stream, write_csv
 
 ALL = [Split("training", 1.0, range(100_000))]
-WITH_LANES = dataclasses.replace(PLAIN, columns={**PLAIN.columns, "lane": "lane"})
 
 
 def record_of(imported, seed=0):
@@ -298,7 +297,8 @@ def test_rows_off_the_road_are_dropped_and_counted(tmp_path):
     points = stream()
     lane = np.where(points[:, 0] == 3, 9, 1)
     points[points[:, 0] == 5, 2] += 1000.0
-    source = dataclasses.replace(WITH_LANES, layout=Layout(mainline=Strip(lanes=(1,))))
+    columns, strip = {**PLAIN.columns, "lane": "lane"}, Strip(lanes=(1,))
+    source = dataclasses.replace(PLAIN, columns=columns, layout=Layout(mainline=strip))
     file = first_file(run(plain(tmp_path / "a.csv", points, lane=lane), source))
     assert file["off_lanes"] == (points[:, 0] == 3).sum()
     assert file["off_ends"] == (points[:, 0] == 5).sum()

@@ -64,14 +64,6 @@ def play(process, n_steps, queried=(0, 3)):
     return found
 
 
-def true_counts(process, asked, *segments):
-    """Of all vehicles and of those that are connected, on some segments in a second."""
-    record = process.traffic.record(1)
-    connected = Penetration(SHARE).connected(process.config.traffic_seeds[1], record)
-    some = record.where(connected[record.vehicle])
-    return tuple(each.counts[int(asked.times[0]), list(segments)] for each in (record, some))
-
-
 # --- groups of channels -------------------------------------------------------------------------
 
 
@@ -103,10 +95,13 @@ def test_queries_count_connected_vehicles_and_sensors_all_in_columns_of_their_ow
     assert task.channels.first.tolist() == [*range(8), 3, 5]
     assert task.sensors.tolist() == [8, 9, 7]
     assert task.channels.group.tolist() == [0] * N + [1] * 4
+    record = process.traffic.record(1)
+    connected = Penetration(SHARE).connected(process.config.traffic_seeds[1], record)
+    some = record.where(connected[record.vehicle])
     for released, asked, _ in play(process, 12):
         assert np.flatnonzero(asked.observed[0]).tolist() == [0, 3, *COLUMNS]
-        every, some = true_counts(process, asked, 0, 3, 7, 3, 5)
-        expected = np.append(some[:2], every[2:])
+        second = int(asked.times[0])
+        expected = np.append(some.counts[second, [0, 3]], record.counts[second, [7, 3, 5]])
         counts, sigma = (
             array[0, [0, 3, *COLUMNS], 0] * LENGTH for array in (released.values, released.sigma)
         )

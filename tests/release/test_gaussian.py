@@ -52,18 +52,14 @@ def test_a_unit_bounds_how_often_it_counts_and_boundaries_are_nominal_unless_giv
 # --- true values ---------------------------------------------------------------------------------
 
 
-def three_vehicles(**asked):
-    places = np.array([[AWAY, 1, 1], [AWAY, 1, 2], [AWAY, AWAY, 5]])
-    speeds = np.array([[0, 20, 150], [0, 60, 40], [0, 0, 102]])
-    return Worlds(record(places, speeds)).started(CappedSettings(**asked))
-
-
 def true_values(release, time, *queried):
     return release.true_values(request(time, np.isin(np.arange(COLUMNS), queried)))[0]
 
 
 def test_a_flow_is_a_sum_of_centred_and_clipped_speeds():
-    release = three_vehicles()
+    places = np.array([[AWAY, 1, 1], [AWAY, 1, 2], [AWAY, AWAY, 5]])
+    speeds = np.array([[0, 20, 150], [0, 60, 40], [0, 0, 102]])
+    release = Worlds(record(places, speeds)).started(CappedSettings())
     np.testing.assert_array_equal(true_values(release, 1, 1)[1], [2.0, (20 - 51) + (60 - 51)])
     now = true_values(release, 2, 1, 2, 3)
     np.testing.assert_array_equal(now[1], [1.0, 51.0])  # 150 km/h is clipped to 102

@@ -24,14 +24,6 @@ CLASSES = (
     VehicleClass("car", 0.7),
     VehicleClass("truck", 0.3, length=12.0, largest_speed=60.0, drivers=Drivers("Krauss")),
 )
-ROAD = UNEVEN.replaced(
-    duration=240, incident=Incident(5, ((60.0, 120.0, 10.0), (120.0, 140.0, 40.0)))
-)
-
-
-@pytest.fixture(scope="module")
-def uneven():
-    return simulate(ROAD, 0)
 
 
 def mean_speed(record, steps, columns):
@@ -66,9 +58,11 @@ def test_traffic_flows_jams_and_recovers():
     assert min(outflow(record, ramp, 450, 700) for ramp in range(n, n + 4)) > 100
 
 
-def test_the_limit_after_an_incident_is_that_of_its_segment(uneven):
-    assert mean_speed(uneven, slice(80, 120), 5) < 20.0
-    assert 40.0 < mean_speed(uneven, slice(180, 240), 5) <= 1.2 * 80.0
+def test_the_limit_after_an_incident_is_that_of_its_segment():
+    phases = (60.0, 120.0, 10.0), (120.0, 140.0, 40.0)
+    record = simulate(UNEVEN.replaced(duration=240, incident=Incident(5, phases)), 0)
+    assert mean_speed(record, slice(80, 120), 5) < 20.0
+    assert 40.0 < mean_speed(record, slice(180, 240), 5) <= 1.2 * 80.0
 
 
 def test_the_lowest_limit_holds_and_returns_to_normal_where_there_is_a_gap():
