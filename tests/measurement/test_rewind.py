@@ -51,11 +51,13 @@ WAYS = [("ekf", PAID), ("recurrent", COUNTED), ("enkf", "printed"), ("mhe", PAID
 )
 def test_the_estimator_is_as_if_it_had_had_the_readings_in_time(estimator, privacy):
     """At each interval's end, bit for bit, but for what it says of the releases of this second."""
-    process = begun(estimator=estimator, privacy=privacy)
+    interval = 2 * T if privacy == "printed" else T  # which is told of in two seconds or in one
+    seconds, loops = seconds_told(interval), LOOPS | {"interval": interval}
+    process = begun(estimator=estimator, privacy=privacy, loops=loops)
     by_hand, given = copy.deepcopy(process.estimator), {e: [] for e in ALL.tolist()}
     kept, beside = process.rewind.follow, process.loops.segments
-    # Of the one second that is told, without the interval's readings; NaN where it was not lived.
-    estimated = np.full((1, len(ALL), len(beside), 2), np.nan)
+    # Of the seconds that are told, without the interval's readings; NaN where they were not lived.
+    estimated = np.full((len(seconds), len(ALL), len(beside), 2), np.nan)
 
     def spy(episodes, traffic, times, inputs, measured):
         for k, episode in enumerate(episodes.tolist()):
@@ -63,23 +65,23 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_time(estimator, priva
             seen = own.observed[..., None]  # the rest may be anything, and is not kept
             own = own._replace(values=own.values * seen, sigma=own.sigma * seen)
             given[episode].append((inputs[k : k + 1].copy(), own))
-        now = (times - 1) % T == seconds_told(T)
+        second, row = np.nonzero((times - 1) % interval == seconds[:, None])
         found = process.estimator.estimate()
         own = np.stack([found.density[:, beside], found.speed[:, beside]], axis=-1)
-        estimated[0, episodes[now]] = own[episodes[now]]
+        estimated[second, episodes[row]] = own[episodes[row]]
         kept(episodes, traffic, times, inputs, measured)
 
     process.rewind.follow = spy
     n_ends = 0
     for action in sampled(process, 30):
         process.step(ALL, action)
-        for episode in ALL[process.time % T == 0]:
+        for episode in ALL[process.time % interval == 0]:
             own = np.array([episode])
             loops = process.loops
             said = loops.said_until(process.traffic_index[own], process.time[own])
             told = loops.told(said, estimated[:, own])
             n = len(given[episode])  # fewer than an interval where the episode began within
-            for second, (inputs, measured) in enumerate(given[episode], T - n):
+            for second, (inputs, measured) in enumerate(given[episode], interval - n):
                 by_hand.predict(own, inputs)
                 by_hand.update(own, loops.added(measured, told, np.array([second])))
             given[episode].clear()
@@ -89,7 +91,7 @@ def test_the_estimator_is_as_if_it_had_had_the_readings_in_time(estimator, priva
             for mine, other in zip(by_hand.estimate(), process.estimate, strict=True):
                 np.testing.assert_array_equal(mine[own], other[own])
             n_ends += 1
-    assert n_ends == 3 + 3 + 3 + 3
+    assert n_ends == {T: 3 + 3 + 3 + 3, 2 * T: 1 + 2 + 2 + 1}[interval]
 
 
 @pytest.mark.parametrize("privacy", ["printed", COUNTED])
