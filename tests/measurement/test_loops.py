@@ -65,6 +65,7 @@ def test_free_traffic_has_flow_over_speed_and_a_jam_has_more():
     said = told([15, 10, 30], [102.0, 15.0, 15.0])
     plain = np.array([2700 / 102, 1800 / 15, 5400 / 15])
     assert said.density[0] == pytest.approx(plain[0], rel=0.03)
+    assert told(45, 102.0, interval=60).density == pytest.approx(plain[0], rel=0.03)
     assert said.density[1] > 1.3 * plain[1]
     assert said.density[2] == pytest.approx(plain[2])  # as dense as vehicles at this speed are
     assert said.speed[0] == pytest.approx(102.0, rel=0.02)
