@@ -37,7 +37,7 @@ def test_importing_the_package_and_making_environments_is_light():
 import gymnasium as gym, sys, dptse_env
 assert not {"libsumo", "numba", "torch", "matplotlib"} & set(sys.modules)
 gym.make("dptse/PaperHighway-v0"), gym.make_vec("dptse/PaperHighway-v0", 4)
-assert not {"libsumo", "torch", "stable_baselines3"} & set(sys.modules)
+assert not {"filterpy", "libsumo", "torch", "stable_baselines3"} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
 

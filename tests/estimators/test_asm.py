@@ -1,7 +1,5 @@
 """Adaptive smoothing beside its equations, and what it gives."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -18,20 +16,14 @@ from dptse_env.estimators.asm import (
     STALE_VARIANCE,
     TRUSTED,
 )
-from dptse_env.model import ARZModel
 from dptse_env.traffic import PAPER_HIGHWAY
-from tests.helpers import UNEVEN, stretch
-from tests.model.oracle import PUBLISHED
+from tests.helpers import UNEVEN
 
-from .helpers import Episodes, run, simulate, started, step
+from .helpers import run, simulate, started, step
 
 ASM = AdaptiveSmoothingSettings(
     time=6.0, length=0.15, free_wave=90.0, jam_wave=15.0, threshold=55.0, boundary_weight=0.7
 )
-
-
-def smoothing(**changes):
-    return EstimatorSettings(asm=replace(AdaptiveSmoothingSettings(), **changes))
 
 
 class Textbook:
@@ -173,14 +165,19 @@ class Textbook:
         return innovations
 
 
-def held_to_the_equations(episodes, settings, n_steps):
+@pytest.mark.parametrize(
+    ("release", "road"), [("speed", PAPER_HIGHWAY), ("flow", PAPER_HIGHWAY), ("rows", UNEVEN)]
+)
+def test_it_is_the_sum_over_all_values_that_its_equations_say(release, road):
+    settings = EstimatorSettings(asm=ASM)
+    episodes = simulate("published", n_steps=60, noise=1.5, release=release, road=road)
     model, close = episodes.model, {"rtol": 1e-9, "atol": 1e-9}
     smoother = started("asm", "compiled", episodes, settings)
     textbook = Textbook(model, episodes.start[0], settings)
-    centre = np.full((n_steps, 1, model.n_segments), np.nan)
+    centre = np.full((60, 1, model.n_segments), np.nan)
     if model.centre is not None:
         centre[:] = model.centre if episodes.centre is None else episodes.centre
-    for k in range(n_steps):
+    for k in range(60):
         step(smoother, episodes, k)
         textbook.predict(episodes.inputs[k, 0])
         given = (array[k, 0] for array in (episodes.observed, episodes.values, episodes.sigma))
@@ -190,53 +187,11 @@ def held_to_the_equations(episodes, settings, n_steps):
         np.testing.assert_allclose(smoother.innovations[0], found, **close)
 
 
-@pytest.mark.parametrize(
-    ("release", "road"), [("speed", PAPER_HIGHWAY), ("flow", PAPER_HIGHWAY), ("rows", UNEVEN)]
-)
-def test_it_is_the_sum_over_all_values_that_its_equations_say(release, road):
-    episodes = simulate("published", n_steps=60, noise=1.5, release=release, road=road)
-    held_to_the_equations(episodes, EstimatorSettings(asm=ASM), 60)
-
-
-# What it gives ------------------------------------------------------------------------------------
-
-
-def on_a_road(n_steps, observed, values, parameters=PUBLISHED, **fields):
-    """An episode of values (T or 1, S, 2) whose inputs say of the ends what is measured first."""
-    model = ARZModel(stretch(**fields).road, parameters)
-    S = model.n_segments
-    density, speed = (np.full((1, model.n_boundaries), values[0, 0, i]) for i in range(2))
-    start = model.states(np.full((1, S), values[0, 0, 0]), np.full((1, S), values[0, 0, 1]))
-    inputs = np.tile(model.boundary_inputs(density, speed), (n_steps, 1, 1))
-    shape = n_steps, 1, S
-    return Episodes(
-        model, start, inputs, np.empty(0), np.broadcast_to(observed, shape),
-        np.broadcast_to(values[:, None], (*shape, 2)).copy(), np.full((*shape, 2), 1e-3),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(("speed", "wave", "way"), [(15.0, 18.0, -1), (95.0, 120.0, 1)])
-def test_changes_travel_with_the_wave_of_the_traffic(speed, wave, way):
-    """Of three segments the middle one is measured, and a neighbour learns of it later."""
-    values = np.tile([30.0, speed], (120, 3, 1))
-    values[60:, :, 0] = 60.0
-    episodes = on_a_road(120, np.arange(3) == 1, values, n_mainline=3)
-    smoother = started("asm", "compiled", episodes, smoothing(time=1.0, boundary_weight=0.0))
-    found = []
-    run(smoother, episodes, range(120), lambda _: found.append(smoother.estimate().density[0]))
-    upstream, own, downstream = np.array(found).T
-    assert own[59] < 31.0
-    assert own[64] > 59.0
-    late, early = (downstream, upstream) if way > 0 else (upstream, downstream)
-    arrival = 59.0 + 3600.0 * 0.1 / wave
-    assert np.abs(np.interp(45.0, late, np.arange(120)) - arrival) < 1.0
-    np.testing.assert_allclose(early, own, atol=1.0)
-
-
 def test_a_mean_stays_when_nothing_follows_for_long():
     """Weights fall by exp(-10) each second, to less than the smallest number."""
     episodes = simulate("published", n_steps=200)
-    smoother = started("asm", "compiled", episodes, smoothing(time=0.1, boundary_weight=0.0))
+    settings = EstimatorSettings(asm=AdaptiveSmoothingSettings(time=0.1, boundary_weight=0.0))
+    smoother = started("asm", "compiled", episodes, settings)
     run(smoother, episodes, range(12))
     nothing = np.zeros((1, 19), bool)
     run(smoother, episodes, range(12, 150), observed=nothing)

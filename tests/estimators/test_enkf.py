@@ -5,7 +5,6 @@ import pytest
 
 from dptse_env.estimators import (
     BACKENDS,
-    DemandSettings,
     EnsembleSettings,
     EstimatorSettings,
 )
@@ -15,7 +14,7 @@ from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
 from tests.helpers import make_channels, pairwise
 from tests.model.oracle import W99
 
-from .helpers import RELEASES, RICH, run, simulate, started, step, update
+from .helpers import RELEASES, RICH, simulate, started, step
 
 OPTIONS = {
     "rich": {name: getattr(RICH, name) for name in ("demand", "vehicle_noise", "flicker")},
@@ -23,7 +22,6 @@ OPTIONS = {
     "inflation": {"enkf": EnsembleSettings(inflation=1.1)},
     "plain": {},
 }
-both_backends = pytest.mark.parametrize("backend", BACKENDS)
 
 
 @pytest.mark.parametrize(
@@ -53,23 +51,6 @@ def test_it_takes_the_steps_of_its_reference(release, bounds, options):
 
 
 # Options ------------------------------------------------------------------------------------------
-
-
-def test_a_tapered_row_acts_near_any_of_its_segments_and_on_the_factor_of_a_near_entry():
-    episodes = simulate(n_steps=10, release="rows")
-    settings = EstimatorSettings(demand=DemandSettings(), enkf=EnsembleSettings(taper=0.25))
-    filters, channels = started("enkf", "compiled", episodes, settings), episodes.model.channels
-    run(filters, episodes, range(9))
-    filters.predict(episodes.everyone, episodes.inputs[9])
-    before = filters.members
-    update(filters, episodes, 9, observed=((channels.first == 1) & (channels.span == 3))[None])
-    moved = np.abs(filters.members - before).max(axis=(0, 1)) > 1e-6
-    near, factors = moved[:38].reshape(19, 2).any(axis=1), moved[38:]
-    # Segments of 0.1 km, on-ramps at the faces 3 and 9 and off-ramps at 6 and 12.
-    x = 0.1 * np.array([*(np.arange(15) + 0.5), 3, 9, 6, 12])
-    reached = (np.abs(x[:, None] - x[[1, 2, 3]]) < 0.25).any(axis=1)
-    np.testing.assert_array_equal(near, reached)
-    np.testing.assert_array_equal(factors, reached[[0, 15, 16]])
 
 
 def test_a_taper_leaves_a_definite_s_where_a_few_members_do_not():

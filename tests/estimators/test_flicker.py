@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from dptse_env.estimators import EstimatorSettings, Measurement, make_estimator
+from dptse_env.estimators import Measurement
 from dptse_env.estimators.flicker import SPREAD, Flicker
 from dptse_env.model import ARZModel, load_parameters
-from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY, RecordLibrary
+from dptse_env.traffic import PAPER_HIGHWAY
 from tests.helpers import make_channels
 
 from .helpers import model_of
@@ -70,23 +70,6 @@ def test_a_channel_of_several_segments_has_the_flicker_of_its_length():
     assert three == pytest.approx((one - rounding) / 3.0 + rounding / 9.0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("corridor", [PAPER_HIGHWAY, SHORT_HIGHWAY], ids=lambda road: road.name)
-def test_recorded_counts_flicker_as_much(corridor):
-    """Counts against their means over 41 s, in free and in congested traffic."""
-    counts = np.stack([RecordLibrary().get(corridor, seed).counts for seed in range(8)])
-    counts = counts[:, 60:, : corridor.geometry.n_mainline].astype(float)
-    window = np.lib.stride_tricks.sliding_window_view(counts, 41, axis=1)
-    mean, square = window.mean(axis=-1), (window[..., 20] - window.mean(axis=-1)) ** 2 * 41 / 40
-    share = mean / 0.1 / (corridor.road.lanes[0] * 400.0 / 3.0)
-    for low, high in ((0.03, 0.1), (0.1, 0.2), (0.2, 0.4)):
-        inside = (share >= low) & (share < high)
-        if inside.sum() < 2000:
-            continue
-        expected = (1.0 / 12.0 + mean[inside] * (1.0 - share[inside]) ** 6).mean()
-        assert 0.5 < square[inside].mean() / expected < 1.6
-
-
 def test_a_reset_forgets_when_channels_were_observed():
     model, everything = model_of("w99-3lane", "speed"), np.ones((2, 19), bool)
     flicker, states = Flicker(model, 2), np.repeat(uniform(model, 30.0, 60.0), 2, axis=0)
@@ -97,28 +80,3 @@ def test_a_reset_forgets_when_channels_were_observed():
     flicker.reset(np.array([1]))
     last = flicker.deviations(*seen)
     np.testing.assert_array_equal(last, np.stack([later[0], first[1]]))
-
-
-@pytest.mark.parametrize("estimator", ["ekf", "ukf", "mhe"])
-def test_noise_of_vehicles_does_not_move_w(estimator):
-    """psi = w rho: a covariance [[1, w], [w, w^2]] times that of rho leaves w as it is."""
-    settings = EstimatorSettings(
-        process_noise=(1e-9, 1e-9), vehicle_noise=(0.05, 0.0), initial_variance=1e-18
-    )
-    model = model_of("w99-3lane", "speed")
-    made = make_estimator(estimator, "compiled", model, 1, settings)
-    start = uniform(model, 40.0, 80.0)
-    made.reset(ONE, start, [np.random.default_rng(0)])
-    inputs = model.boundary_inputs(
-        np.full((1, model.n_boundaries), 40.0), np.full((1, model.n_boundaries), 80.0)
-    )
-    nothing = np.zeros((1, model.channels.size), bool)
-    values = np.zeros((1, model.channels.size, 2))
-    made.predict(ONE, inputs)
-    made.update(ONE, Measurement.of(model, nothing, values, values))
-    covariance = made.covariances[0].reshape(19, 2, 19, 2)
-    w = start[0, 1] / start[0, 0] / model.parameters.free_flow_speed
-    for s in range(15):  # on a ramp the density is out of bounds
-        block = covariance[s, :, s]
-        expected = 0.05**2 * 40.0 / 400.0 * np.outer([1.0, w], [1.0, w])
-        np.testing.assert_allclose(block, expected, rtol=1e-6, atol=1e-12)

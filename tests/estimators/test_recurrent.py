@@ -1,7 +1,6 @@
 """The recurrent network beside the one that is trained, and what it gives."""
 
 import dataclasses
-import hashlib
 import warnings
 
 import numpy as np
@@ -11,9 +10,7 @@ from dptse_env.config import resolve
 from dptse_env.estimators import Measurement
 from dptse_env.estimators.recurrent import (
     member_for,
-    outside,
     read_weights,
-    shipped_weights,
     write_weights,
 )
 from dptse_env.estimators.recurrent_kernels import (
@@ -211,36 +208,7 @@ def test_a_limit_that_nobody_drives_at_makes_no_difference_to_a_calibrated_road(
     assert [each.speed_unit for each in shipped] == [100.0, 150.0]
 
 
-PLAYED = {
-    "flows": (False,), "own_parameters": (False,), "span": (3,), "epsilon": (100.0,),
-    "connected": (0.1, 1.0), "slow_share": (0.3,), "slow_speed": (80.0,), "headway": (),
-}  # fmt: skip
-
-
-def test_what_weights_were_not_trained_on_is_named(tmp_path):
-    path, road = tmp_path / "weights.safetensors", PAPER_HIGHWAY
-    for ranges, names in (
-        ({"n_mainline": [3, 15], "lanes": [1, 3], "span": [1, 3], "flows": [0, 0]}, []),
-        ({"n_mainline": [3, 9]}, ["n_mainline"]),
-        ({"span": [1, 2], "flows": [1, 1]}, ["span", "flows"]),
-        ({"lanes": [2, 3], "speed_limit": [80.0, 100.0]}, ["speed_limit", "lanes"]),
-        ({"epsilon": [0.5, 20.0], "slow_share": [0.0, 0.2]}, ["epsilon", "slow_share"]),
-        ({"slow_speed": [25.0, 95.0], "headway": [1.0, 2.0]}, []),
-    ):
-        write_weights(path, random_weights(), {**card(), "ranges": ranges})
-        assert set(outside(read_weights(str(path)), road.road, PLAYED)) == set(names)
-
-
 # Files of weights ---------------------------------------------------------------------------------
-
-DIGESTS = {
-    "highway-flows": ("a7cd6a7d0da0", "b8053dba8f85"),
-    "highway-speeds": ("98c08e7ad753", "5eabe2045192"),
-    "long-highway-flows": ("0718f2eebe91", "ce544dbbe3ab"),
-    "roads-flows": ("", "b1289751e554"),
-    "roads-speeds": ("", "9a010ec87657"),
-}
-"""The first digits of the digests of the files before they were converted, and of their weights."""
 
 
 @pytest.fixture
@@ -257,16 +225,6 @@ def test_what_is_written_is_read(path, tmp_path):
     assert {key: value for key, value in saved.card.items() if key != "sha256"} == card()
     write_weights(tmp_path / "again.safetensors", random_weights(), card())
     assert (tmp_path / "again.safetensors").read_bytes() == path.read_bytes()
-
-
-def test_the_weights_that_ship_are_those_that_were_recorded():
-    digests = {}
-    for name in shipped_weights():
-        saved, content = read_weights(name), hashlib.sha256()
-        for array in saved.weights:
-            content.update(array.tobytes())
-        digests[name] = saved.card.get("converted_from", "")[:12], content.hexdigest()[:12]
-    assert digests == DIGESTS
 
 
 def test_a_pair_is_found_by_the_name_it_shares(tmp_path):

@@ -3,18 +3,13 @@
 import itertools
 import json
 import re
-from dataclasses import asdict
 
 import pytest
 
 from dptse_env.estimators import ESTIMATORS
 from dptse_env.estimators.settings import (
-    BlendSettings,
-    DemandSettings,
-    EnsembleSettings,
     EstimatorSettings,
     HorizonSettings,
-    SigmaPointSettings,
 )
 from dptse_env.estimators.tuned import (
     available_settings,
@@ -52,25 +47,6 @@ FILE = {"mhe-published-corrected": ENTRY}
 def test_a_bad_setting_is_named(field, value, message):
     with pytest.raises(ValueError, match=r"^estimator_settings\." + message):
         EstimatorSettings(**{field: value})
-
-
-def test_settings_survive_json():
-    """Nested ones may be given as mappings."""
-    settings = EstimatorSettings(
-        process_noise=(0.1, 0.2),
-        walk_noise=(0.3, 0.4),
-        speed_cap=1.05,
-        noise_scale=(1.5, 2.5),
-        bounds="box",
-        demand=DemandSettings(memory=60.0),
-        ukf=SigmaPointSettings(alpha=0.5),
-        enkf=EnsembleSettings(inflation=1.1, taper=2.0),
-        mhe=HorizonSettings(horizon=4, arrival_noise=(0.1, 0.2)),
-        blend=BlendSettings(density_weight=0.3, speed_weight=0.9),
-    )
-    again = EstimatorSettings(**json.loads(json.dumps(asdict(settings))))
-    assert again == settings
-    assert hash(again) == hash(settings)
 
 
 def test_shipped_sets_are_named_after_what_they_are_for():
