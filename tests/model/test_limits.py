@@ -2,30 +2,15 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dptse_env.model import ARZModel
-from tests.helpers import UNEVEN, pairwise, stretch
+from tests.helpers import stretch
 
 from .oracle import (
-    HIGHWAY,
     NO_RELAXATION,
     PUBLISHED,
-    W99,
     Oracle,
-    random_inputs,
-    random_states,
 )
-
-seeds = st.integers(0, 2**32 - 1)
-both_sets = pytest.mark.parametrize("parameters", [PUBLISHED, W99], ids=lambda p: p.name)
-
-
-def drawn(model, seed, n=4):
-    rng = np.random.default_rng(seed)
-    return random_states(model, n, rng), random_inputs(model, n, rng)
-
 
 # Exact solutions ----------------------------------------------------------------------------------
 
@@ -91,49 +76,3 @@ def test_converges_to_the_exact_solution_of_the_riemann_problem(left, right):
 
 
 # Balances, bounds and limits ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("road", "parameters"), pairwise([HIGHWAY, UNEVEN], [PUBLISHED, W99, NO_RELAXATION])
-)
-@given(seed=seeds)
-def test_what_the_road_holds_changes_by_what_passes_its_ends(road, parameters, seed):
-    model = ARZModel(road.road, parameters)
-    states, inputs = drawn(model, seed)
-    w, q, _, source = Oracle(road, parameters).flows(states, inputs)
-    entering, w_in = np.array(list(source.values())).swapaxes(0, 1)
-    lengths, exits = model.road.lengths[: model.n_segments], model.road.exits
-    change = model.step(states, inputs) - states
-    through = (entering.sum(axis=0) - q[exits].sum(axis=0)) / 3600.0
-    np.testing.assert_allclose(change[:, 0::2] @ lengths, through, atol=1e-9)
-    if np.isinf(parameters.relaxation_time):
-        through = ((entering * w_in).sum(axis=0) - (q * w)[exits].sum(axis=0)) / 3600.0
-        atol = 1e-9 * parameters.free_flow_speed
-        np.testing.assert_allclose(change[:, 1::2] @ lengths, through, rtol=1e-11, atol=atol)
-
-
-@both_sets
-@pytest.mark.parametrize("road", [HIGHWAY, UNEVEN], ids=["highway", "uneven"])
-@given(seed=seeds, largest_w=st.sampled_from([1.0, 1.1]))
-def test_density_stays_positive_and_w_within_its_bounds(road, parameters, seed, largest_w):
-    """And nobody drives backwards where no w exceeds the free flow's."""
-    model, v_f = ARZModel(road.road, parameters), parameters.free_flow_speed
-
-    def w_of(states):  # the plain quotient, in what counts as a vacuum too
-        rho, psi = model.components(states)
-        return np.divide(psi, rho, np.full_like(rho, v_f), where=rho > 0.0)
-
-    rng, columns = np.random.default_rng(seed), model.road.entry_inputs + 1
-    states = random_states(model, 4, rng)
-    states[:, 1::2] = np.minimum(states[:, 1::2], largest_w * v_f * states[:, 0::2])
-    for _ in range(20):
-        inputs = random_inputs(model, 4, rng)
-        inputs[:, columns] = np.minimum(inputs[:, columns], largest_w * v_f)
-        before = np.concatenate([w_of(states), inputs[:, columns], np.full((4, 1), v_f)], axis=1)
-        states = model.step(states, inputs)
-        w, (rho, psi) = w_of(states), model.components(states)
-        assert np.all(states >= 0.0)
-        assert np.all(w >= before.min(axis=1, keepdims=True) - 1e-9)
-        assert np.all(w <= before.max(axis=1, keepdims=True) + 1e-9)
-        if largest_w == 1.0:
-            assert np.all(rho * model.pressure(rho) - psi <= 1e-9 * parameters.jam_density * v_f)
