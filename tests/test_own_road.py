@@ -58,18 +58,6 @@ def test_every_estimator_and_release_model_runs_on_an_uneven_road(road_file, key
     assert seen[-1][4]["rmse_density"] < 100.0
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "mhe"])
-def test_both_backends_agree_on_an_uneven_road(road_file, estimator):
-    rewards = []
-    for backend in ("compiled", "reference"):
-        settings = {"flicker": True, "vehicle_noise": [0.04, 0.02]}
-        # Prices that follow predictions would magnify what rounding makes of them.
-        keywords = {"privacy": "capped", "estimator_settings": settings}
-        env = make(road_file, estimator=estimator, backend=backend, **keywords)
-        rewards.append([reward for _, reward, *_ in play(env, 40)[1:]])
-    np.testing.assert_allclose(*rewards, rtol=1e-4)
-
-
 def test_weights_on_a_road_unlike_those_of_their_training_are_named(road_file):
     name = "estimator_settings.recurrent.weights"
     with pytest.warns(UserWarning, match=f"{name}: values measured or tuned on"):
@@ -137,20 +125,6 @@ def test_what_lies_beyond_the_card_of_weights_is_told_once(name, keywords, value
         _, (said,) = told_beyond(make)
         assert f"{name} " in said
         assert f"not {value};" in said
-
-
-@pytest.mark.parametrize(("name", "keywords", "value"), BEYOND)
-def test_a_stream_beyond_the_card_of_weights_is_told_once(name, keywords, value, tmp_path):
-    if name in ("span", "epsilon", "connected"):
-        return  # of queries, which a stream has not
-    settings = weights_settings(tmp_path, **{**KNOWN, "flows": [int(name == "flows"), 1]})
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        road = resolve("private-plain", {k: v for k, v in keywords.items() if k != "privacy"})
-    make = partial(RoadEstimator, road.corridor, "recurrent", estimator_settings=settings)
-    _, (said,) = told_beyond(make)
-    assert f"{name} " in said
-    assert f"not {value};" in said
 
 
 def test_queries_of_a_road_file_do_not_lie_beyond_the_card_where_a_stream_has_none(tmp_path):

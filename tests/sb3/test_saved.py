@@ -311,6 +311,12 @@ def arguments(**values):
     return lambda card, weights: card["policy"]["arguments"].update(values)
 
 
+def clipped_at_zero(card, weights):
+    size = weights["mlp_extractor.policy_net.0.weight"].shape[1]
+    given = {"mean": np.zeros(size), "variance": np.ones(size), "clip": 0.0, "epsilon": 1e-8}
+    weights.update({f"normalisation.{name}": np.array(each) for name, each in given.items()})
+
+
 WRONG = {
     "slots": [
         (lambda c, w: c["fits"].update(format="dptse-policy-1"), "format is 'dptse-policy-1'"),
@@ -334,6 +340,7 @@ WRONG = {
         (arguments(units="Linear"), "units must be one of Tanh, ReLU"),
         (lambda c, w: c.update(acts="both"), "acts must be one of deterministic, drawn"),
         (lambda c, w: w.update({"normalisation.clip": np.ones(())}), "lacks the arrays normal"),
+        (clipped_at_zero, "clip and epsilon above 0"),
         (lambda c, w: c["policy"].update({"class": "MaskableActorCriticPolicy"}),
          "acts by action encoding 'sequential', got 'mask'"),
     ],

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from stable_baselines3.common.evaluation import evaluate_policy
 
 from dptse_env.config import resolve
 from dptse_env.estimators import Estimate
 from dptse_env.parts import make_interface
 from dptse_env.release import Queries
 from dptse_env.schedules import best_queries, make_schedule, query_values
-from tests.helpers import SumRelease, make_env
+from tests.helpers import SumRelease
 
 from .playing import begin, make_batch
 
@@ -97,12 +96,6 @@ def test_oldest_first_asks_the_oldest_and_breaks_ties_in_turn():
         counts += action
     assert counts[14] == 0  # it has a fixed sensor
     assert counts[:14].min() > 40
-
-
-def test_stable_baselines3_evaluates_a_schedule():
-    env = make_env(horizon=20, traffic_seeds="0:1")
-    mean, _ = evaluate_policy(make_schedule("shift-ahead", env), env, n_eval_episodes=2, warn=False)
-    assert mean < 0
 
 
 def made_up(env, k=20):

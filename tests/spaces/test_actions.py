@@ -124,19 +124,6 @@ def test_scores_beyond_the_bounds_count_as_the_bounds():
         assert indices(beyond.decode(scores)) == indices(expected)
 
 
-SIZES = [(MaskAction, 12), (ScoresAction, 6), (SlotsAction, 12), (SequentialAction, 6)]
-
-
-@pytest.mark.parametrize(("kind", "size"), SIZES)
-def test_masks_flag_all_choices_that_are_valid(kind, size):
-    """In the order of sb3-contrib, whose policies the tests of clients train with them."""
-    picked = np.zeros((3, 6), dtype=bool)
-    picked[1, 2] = kind is SequentialAction
-    masks = kind(queries(2, EQUAL)).masks(picked)
-    assert (masks.shape, masks.dtype) == ((3, size), bool)
-    assert np.argwhere(~masks).tolist() == ([[1, 2]] if kind is SequentialAction else [])
-
-
 def test_slots_are_as_many_as_there_may_be_queries_and_are_filled_up_and_cut():
     for bandwidth, slots in ((4, 4), (7, 5), (99, 8)):
         assert Played(SlotsAction, bandwidth, COSTS).encoding.space.nvec.tolist() == [8] * slots

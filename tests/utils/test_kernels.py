@@ -145,15 +145,6 @@ def test_a_damaged_file_is_made_again_and_not_unpickled(fresh, kept, damage, cap
     assert fresh() == (3.0, 1)
 
 
-def test_a_folder_in_the_place_of_a_file_makes_way(fresh, kept):
-    fresh()
-    (file,) = kept.iterdir()
-    file.unlink()
-    file.mkdir()
-    assert fresh() == (3.0, 0)
-    assert fresh() == (3.0, 1)
-
-
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such modes")
 @pytest.mark.parametrize("right", [0o020, 0o002])
 def test_machine_code_that_others_can_write_to_is_not_used(fresh, kept, right, caplog, monkeypatch):
@@ -257,12 +248,6 @@ def test_garbage_is_collected_as_before_where_compiling_fails(load):
         assert gc.get_threshold() == (700, 5, 5)
     finally:
         gc.set_threshold(*usual)
-
-
-def test_a_part_runs_as_python_when_python_calls_it(load):
-    assert load().scaled(1.5) == 3.0
-    with pytest.raises(TypeError, match="can't multiply sequence"):
-        load().scaled("a")
 
 
 def test_a_part_has_one_version_for_constants_and_variables(load):
