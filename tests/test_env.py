@@ -63,21 +63,6 @@ def test_an_episode_ends_by_truncation_at_the_horizon():
         env.step(env.action_space.sample())
 
 
-def test_sequential_actions_move_the_traffic_on_their_last_pick():
-    env = make_env(action="sequential", bandwidth=3, horizon=5, truth_in_info=True)
-    env.reset(seed=0)
-    times, rewards, masks, truncated = [], [], [], False
-    while not truncated:
-        free = env.unwrapped.action_masks()
-        _, reward, _, truncated, info = env.step(np.flatnonzero(free)[0])
-        times.append(info["time"])
-        rewards.append(reward)
-        masks.append(int(free.sum()))
-    assert times == [0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5]
-    assert masks == [6, 5, 4] * 5
-    assert [reward == 0 for reward in rewards] == [True, True, False] * 5
-
-
 EVERY_INFO = [
     {},
     {"truth_in_info": True, "privacy": COUNTED},

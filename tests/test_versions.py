@@ -63,24 +63,6 @@ def test_every_version_of_python_gives_the_same_digest(folder):
     assert digest(folder) == "e62759696cce"
 
 
-@pytest.mark.parametrize(
-    ("name", "before", "after"),
-    [
-        ("package/step.py", "-1.5e-3", "-1.6e-3"),
-        ("package/step.py", "c=None", "c"),
-        ("package/step.py", "a < b", "a <= b"),
-        ("package/step.py", '"two"', '"three"'),
-        ("package/tuned.json", "{}", "[]"),
-        ("package/nets/net.safetensors", "weights", "heights"),
-        ("agents/play.py", "1", "2"),
-    ],
-)
-def test_the_digest_moves_with_what_moves_numbers(name, before, after, folder):
-    first, path = digest(folder), folder / name
-    path.write_text(path.read_text().replace(before, after))
-    assert digest(folder) != first
-
-
 def test_the_digest_stays_where_numbers_do(folder):
     first = digest(folder)
     for name, text in {

@@ -1,8 +1,7 @@
-"""Episodes for the tests of estimators, simulated and recorded, what runs them, and weights."""
+"""Simulated episodes for the tests of estimators, what runs them, and weights."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from dptse_env.estimators.base import Estimator
 from dptse_env.estimators.recurrent import FORMAT, write_weights
 from dptse_env.estimators.recurrent_kernels import FEATURES, Weights, shapes
 from dptse_env.model import ARZModel, Channels, load_parameters
-from dptse_env.traffic import PAPER_HIGHWAY, Corridor, RecordLibrary
+from dptse_env.traffic import PAPER_HIGHWAY, Corridor
 from dptse_env.utils.arrays import BoolArray, FloatArray, IntArray
 from tests.helpers import make_channels
 
@@ -125,30 +124,6 @@ def simulate(
 def _measured(model: ARZModel, truth: FloatArray, centre: FloatArray | None) -> FloatArray:
     around = [None] * len(truth) if centre is None else centre
     return np.stack([model.measure(x, v_0) for x, v_0 in zip(truth, around, strict=True)])
-
-
-@functools.cache
-def recorded(release: str) -> Episodes:
-    """A simulated rush hour on the paper's highway, 700 steps, five sensors going round."""
-    record = RecordLibrary().get(PAPER_HIGHWAY, 3)
-    model, sigma = model_of("w99-3lane", release), SPEEDS if release == "speed" else FLOWS
-    s, v_f = model.n_segments, model.parameters.free_flow_speed
-    density = record.counts / PAPER_HIGHWAY.geometry.segment_length
-    sums, counts = record.speed_sums, record.counts
-    speed = np.divide(sums, counts, out=np.full(sums.shape, np.nan), where=counts > 0)
-    inputs = model.boundary_inputs(density[:-1, s:], speed[:-1, s:])
-    traffic = np.stack([density[1:, :s], np.nan_to_num(speed[1:, :s], nan=102.0)], axis=-1)
-    values = traffic.copy()
-    if release == "flow":
-        values[..., 1] = traffic[..., 0] * (traffic[..., 1] - REFERENCE_SPEED)
-    values += sigma * np.random.default_rng(0).normal(size=traffic.shape)
-    observed = np.zeros((len(traffic), s), bool)
-    for k, row in enumerate(observed):
-        row[[*((3 * np.arange(5) + k) % 15), *model.road.exits]] = True
-    start = model.states(0.05 * model.jam_density[None], np.full((1, s), 0.64 * v_f))
-    truth = model.states(traffic[..., 0], traffic[..., 1])
-    each = (array[:, None] for array in (inputs, truth, observed, values))
-    return Episodes(model, start, *each, np.broadcast_to(sigma, values[:, None].shape))
 
 
 # Running ------------------------------------------------------------------------------------------

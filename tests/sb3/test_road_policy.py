@@ -168,15 +168,6 @@ def test_neighbours_and_the_whole_road_count():
     assert far.max() < near.max()
 
 
-def test_segments_share_one_scorer():
-    """Away from its ends, scores shift with what the segments see."""
-    policy = make_policy("short-highway")
-    inputs = torch.randn(12, policy.features.n_inputs, 1)
-    scores = policy.scorer(inputs)
-    shifted = policy.scorer(inputs.roll(1, dims=0))
-    torch.testing.assert_close(shifted[:, 2:-1], scores[:, 1:-2])
-
-
 def test_policies_of_two_environments_share_their_weights():
     policy = make_policy("short-highway")
     config = resolve("short-plain", {"action": "slots", "bandwidth": 4})

@@ -116,14 +116,6 @@ def test_equal_scores_are_a_round_robin_also_where_costs_differ():
     assert [each[-1] for each in found] == [4, 5, 4]
 
 
-def test_scores_beyond_the_bounds_count_as_the_bounds():
-    beyond, clipped = Played(ScoresAction), Played(ScoresAction)
-    scores = np.array([3.0, -9.0, 1.0, 0.2, 7.0, 1.1])
-    for _ in range(5):
-        expected = clipped.decode(np.clip(scores, -1, 1))
-        assert indices(beyond.decode(scores)) == indices(expected)
-
-
 def test_slots_are_as_many_as_there_may_be_queries_and_are_filled_up_and_cut():
     for bandwidth, slots in ((4, 4), (7, 5), (99, 8)):
         assert Played(SlotsAction, bandwidth, COSTS).encoding.space.nvec.tolist() == [8] * slots

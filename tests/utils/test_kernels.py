@@ -5,7 +5,6 @@ import importlib
 import logging
 import os
 import pickle
-import subprocess
 import sys
 import threading
 
@@ -225,18 +224,6 @@ def test_compiling_what_is_slow_is_said_once(load, kept, said, monkeypatch):
     monkeypatch.setattr(kernels, "_SLOW", "other")
     load(MODULE.replace("2.0", "4.0")).run(1.5)  # which is quick
     assert not said.messages
-
-
-def test_processes_may_compile_a_kernel_at_once(load, fresh, kept):
-    load()
-    command = [sys.executable, "-c", "from kernels_of_a_test import run; print(run(1.5))"]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(kept)}
-    both = [
-        subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=kept.parent)
-        for _ in range(2)
-    ]
-    assert [process.communicate()[0].split() for process in both] == [[b"3.0"]] * 2
-    assert fresh() == (3.0, 1)
 
 
 def test_garbage_is_collected_as_before_where_compiling_fails(load):
