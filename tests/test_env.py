@@ -169,6 +169,9 @@ BAD = {
     "truth_in_info must be": {"truth_in_info": 1},
     r"penetration\.share must be": {"penetration": 5e-324, "privacy": "paced"},
     "horizon must be": {"horizon": 241},
+    r"query_every must be an integer in 1\.\.3600, got 0": {"query_every": 0},
+    r"query_every must be an integer in 1\.\.3600, got 1\.5": {"query_every": 1.5},
+    "query_every must be at most the 60 s of an episode": {"query_every": 61, "horizon": 60},
     r"horizon must be in 1\.\.239, shorter than the record": {"random_start": True},
     "parameters must be one of": {"parameters": "fast"},
     r"corridor\.segment_length must be at least": {

@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import dptse_env
 from dptse_env.evaluation import evaluate
 from dptse_env.schedules import (
     OBSERVATION_SCHEDULES,
@@ -123,12 +122,6 @@ def test_a_policy_without_a_state_is_refused():
 
     with pytest.raises(ValueError, match=r"policy\.predict\(\) must be an action and a state, got"):
         evaluate(make_env(), Stateless(), [0])
-
-
-def test_the_baseline_is_evaluated_by_its_name():
-    rows = dptse_env.evaluate(make_env(), "shift-ahead", seeds=range(2))
-    assert rows == evaluate(make_env(), make_schedule("shift-ahead", make_env()), [0, 1])
-    assert 0 < rows[0]["rmse_density"] < 60
 
 
 class Noting:

@@ -15,7 +15,6 @@ from tests.helpers import (
     SumRelease,
     fast_and_slow,
     lock_step,
-    make_batch,
     make_env,
 )
 
@@ -67,23 +66,6 @@ def query(process, *queries):
     return process.step(ONE, flags[None].astype(np.int8)).observation
 
 
-def test_a_query_releases_the_mean_over_its_segments():
-    process = make_process(query_spans=(1, 3))
-    released = []
-
-    def release(request, genuine=process.release.release):
-        assert np.flatnonzero(request.observed).tolist() == [2, 5, 6, 11]  # with both sensors
-        released.append(process.release.true_values(request)[0])
-        return genuine(request)
-
-    process.release.release = release
-    query(process, 2, 6)  # segment 2 by itself, and segments 0 to 2
-    density = process.truth(ONE)[0, :, 0]
-    assert released[0][2, 0] == pytest.approx(density[2])
-    assert released[0][6, 0] == pytest.approx(density[:3].mean())
-    assert np.flatnonzero(process.released[0].any(axis=1)).tolist() == [2, 5, 6, 11]
-
-
 def test_age_is_of_segments_and_counts_every_query_that_covers_them():
     process = make_process(query_spans=(2, 3))
     for _ in range(3):
@@ -133,15 +115,3 @@ def test_blocks_of_prices_are_there_where_queries_have_prices_or_they_are_asked_
     assert not {"last_price", "spent_share"} & set(slices)
     process = make_process(privacy="capped", observation=["age", "last_price", "spent_share"])
     assert not process.observe(ONE)[0, 6:].any()
-
-
-def test_masks_show_what_the_rest_of_the_bandwidth_pays_for():
-    env = make_batch(2, privacy=SumRelease, query_spans=(1, 2, 3), bandwidth=3, action="sequential")
-    env.reset(seed=0)
-    assert env.action_masks().all()
-    env.step(np.array([6, 11]))  # segments 0 and 1, or 0 to 2
-    masks = env.action_masks()
-    assert np.flatnonzero(masks[0]).tolist() == [0, 1, 2, 3, 4, 5]
-    assert masks[1].all()  # the second has begun the next second
-    *_, infos = env.step(np.array([0, 11]))
-    assert np.flatnonzero(infos["queried"][0]).tolist() == [0, 6]

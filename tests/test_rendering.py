@@ -55,22 +55,6 @@ def test_a_picture_shows_the_episode_so_far():
     np.testing.assert_array_equal(picture, fresh.render())
 
 
-def test_loops_are_marked_where_they_stand_and_nothing_else_is_new():
-    env = make("rgb_array", loops={"positions": [0.0, 0.4], "ramps": [2]})
-    env.reset(seed=0)
-    env.render()
-    (profile, *_) = env.unwrapped.drawing._picture._canvas.figure.axes
-    names = [text.get_text() for text in profile.get_legend().get_texts()]
-    assert names == ["queried now", "true density", "estimate", "loops"]
-    (marks,) = (line for line in profile.lines if line.get_label() == "loops")
-    np.testing.assert_allclose(marks.get_xdata(), [0.0, 0.4, 0.2])
-    plain = make("rgb_array")
-    plain.reset(seed=0)
-    plain.render()
-    (profile, *_) = plain.unwrapped.drawing._picture._canvas.figure.axes
-    assert len(profile.get_legend().get_texts()) == 3
-
-
 def test_it_is_drawn_anew_every_kth_second_and_at_the_end():
     env = make("rgb_array", render_every=4, horizon=10)
     env.reset(seed=0)

@@ -57,20 +57,6 @@ def exact_delta(mu, epsilon):
 # --- relations -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("epsilon", "delta", "kappa", "analytic", "digits"),
-    [
-        (0.1, 0.05, 16.75, 4.487, 2),
-        (1.0, 0.05, 1.907, 1.333, 3),
-        (1.0, 0.001, 3.244, 2.575, 3),
-        (5.0, 0.05, 0.521, 0.472, 3),
-    ],
-)
-def test_golden_multipliers(epsilon, delta, kappa, analytic, digits):
-    assert round(le_ny_kappa(epsilon, delta), digits) == kappa
-    assert round(1.0 / mu_of(epsilon, delta), 3) == analytic
-
-
 @given(mu=logarithmic(1e-9, 1e3), deviations=st.floats(-20.0, 37.0))
 @example(mu=1e-9, deviations=0.0)
 @example(mu=9.9e-4, deviations=1e-3)  # on either side of where the formula changes
@@ -81,14 +67,6 @@ def test_delta_matches_the_definition_in_many_digits(mu, deviations):
     """Over the whole of its range: `deviations` is minus the argument of the leading term."""
     epsilon = max(mu * (deviations + mu / 2.0), 0.0)
     assert delta_of(mu, epsilon) == close(float(exact_delta(mu, epsilon)), 2e-11)
-
-
-@few
-@given(mu=logarithmic(0.01, 20.0), epsilon=logarithmic(0.01, 50.0), delta=logarithmic(1e-12, 0.4))
-def test_epsilon_and_the_multiplier_match_dp_accounting(mu, epsilon, delta):
-    oracle = get_epsilon_gaussian(1.0 / mu, delta, tol=1e-15)
-    assert epsilon_of(mu, delta) == pytest.approx(oracle, rel=1e-11, abs=1e-13)
-    assert 1.0 / mu_of(epsilon, delta) == close(get_sigma_gaussian(epsilon, delta, 1e-15), 1e-11)
 
 
 @given(epsilon=logarithmic(1e-4, 1e4), delta=logarithmic(1e-12, 0.4999))

@@ -165,22 +165,6 @@ def test_a_road_policy_acts_beside_loops_by_the_estimate_alone(stored):
     np.testing.assert_array_equal(with_loops.predict(seen)[0], without.predict(plain)[0])
 
 
-def test_the_card_describes_the_policy(stored):
-    policy, config = untrained()
-    file = read_policy(stored)
-    assert file.card["fits"]["corridor"] == config.corridor.digest
-    assert file.card["fits"]["bandwidth"] == 2
-    assert file.card["acts"] == "deterministic"
-    assert file.card["keywords"] == {"estimator": "ekf"}
-    assert file.card["trained_on"] == (
-        "short-highway (6 mainline segments of 0.1 km, 2 lanes, fixed sensors on [5, 7])"
-    )
-    assert set(file.card["versions"]) == {"dptse-env", "stable-baselines3", "torch"}
-    assert file.card["figures"] == ABOUT["figures"]
-    assert file.weights.keys() == {f"scorer.{key}" for key in policy.scorer.state_dict()}
-    assert file.identity == file.card["sha256"]
-
-
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [

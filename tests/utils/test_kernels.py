@@ -1,6 +1,5 @@
 """Compiled functions: what is kept on disk, when it is compiled anew, and what is said then."""
 
-import gc
 import importlib
 import logging
 import os
@@ -10,7 +9,6 @@ import threading
 
 import pytest
 from numba.core import config
-from numba.core.errors import TypingError
 
 from dptse_env.utils import kernels
 from dptse_env.utils.kernels import fingerprint
@@ -179,19 +177,6 @@ def test_machine_code_is_that_of_the_types_of_arguments(load):
         assert module.second(getattr(module, name)(1.5, 2.5)) == second
 
 
-def test_machine_code_is_found_wherever_the_module_lies(load, tmp_path, monkeypatch):
-    load().run(1.5)
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    (tmp_path / "kernels_of_a_test.py").rename(elsewhere / "kernels_of_a_test.py")
-    os.utime(elsewhere / "kernels_of_a_test.py", (0, 0))
-    monkeypatch.syspath_prepend(elsewhere)
-    sys.modules.pop("kernels_of_a_test")
-    run = importlib.import_module("kernels_of_a_test").run
-    assert run(1.5) == 3.0
-    assert sum(run.stats.cache_hits.values()) == 1
-
-
 def test_a_kernel_runs_where_no_folder_can_keep_it_and_says_so(load, tmp_path, monkeypatch, caplog):
     (tmp_path / "file").touch()
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "file" / "kept"))
@@ -224,17 +209,6 @@ def test_compiling_what_is_slow_is_said_once(load, kept, said, monkeypatch):
     monkeypatch.setattr(kernels, "_SLOW", "other")
     load(MODULE.replace("2.0", "4.0")).run(1.5)  # which is quick
     assert not said.messages
-
-
-def test_garbage_is_collected_as_before_where_compiling_fails(load):
-    usual = gc.get_threshold()
-    gc.set_threshold(700, 5, 5)
-    try:
-        with pytest.raises(TypingError, match="nothing"):
-            load(MODULE.replace("x * FACTOR", "x.nothing")).run(1.5)
-        assert gc.get_threshold() == (700, 5, 5)
-    finally:
-        gc.set_threshold(*usual)
 
 
 def test_a_part_has_one_version_for_constants_and_variables(load):
