@@ -10,7 +10,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from dptse_env.config import KEYWORDS
 from dptse_env.env import SensorQueryEnv
 from dptse_env.process import TRUTH_INFO
 from dptse_env.registration import ENVIRONMENTS
@@ -187,18 +186,3 @@ def test_bad_keywords_name_themselves():
     for message, keywords in BAD.items():
         with pytest.raises(ValueError, match=f"^{message}"):
             SensorQueryEnv(**{"preset": "short-plain", **keywords})
-
-
-def test_values_that_are_nested_deeply_are_refused_by_their_path():
-    deep = []
-    for _ in range(100_000):
-        deep = [deep]
-    values = dict.fromkeys(KEYWORDS, deep) | {
-        "estimator_settings": {"mhe": {"linearisation": deep}},
-        "privacy": {"preset": deep},
-        "corridor": {"demand": {"mainline": deep}},
-        "render_every": deep,
-    }
-    for key, value in values.items():
-        with pytest.raises(ValueError, match=rf"^{key}\S* must .*\[\[\.\.\.\]\]"):
-            gym.make(SHORT, **{key: value})

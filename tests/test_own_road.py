@@ -180,15 +180,6 @@ def test_a_default_bandwidth_is_limited_to_the_road_and_a_given_one_is_not(tmp_p
         resolve("paper-highway", {"corridor": path, "bandwidth": 5})
 
 
-def test_python_tells_once_what_is_not_of_the_road(road_file):
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("default")
-        for _ in range(2):
-            gym.make(ID, corridor=road_file)
-        gym.make_vec(ID, num_envs=2, corridor=road_file)
-    assert len(told) == 1
-
-
 def test_a_configuration_names_what_is_not_of_the_road(tmp_path):
     path = tmp_path / "plain.toml"
     path.write_text("n_mainline = 5\nduration = 60\nlanes = 2\n[demand]\nmainline = [[0, 1500]]\n")

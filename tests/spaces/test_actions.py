@@ -66,22 +66,6 @@ def test_a_mask_beyond_the_bandwidth_is_cut_in_rotation():
     assert indices(played.decode(everything)) == [0, 1]
 
 
-def test_a_mask_is_cut_to_what_the_bandwidth_pays_for():
-    played = Played(MaskAction, 4, COSTS)
-    decision = played.decode(flags(0, 4, 5, 6))
-    assert indices(decision) == [0, 4]  # option 5 costs more than is left
-    assert decision.n_dropped.tolist() == [2]
-    assert indices(played.decode(flags(0, 4, 5, 6))) == [5, 6]
-    assert indices(played.decode(flags(0, 1))) == [0, 1]
-
-
-def test_an_option_beyond_the_bandwidth_is_never_queried():
-    played = Played(MaskAction, 2, COSTS)
-    assert indices(played.decode(flags(7).astype(float))) == []
-    turns = [indices(played.decode(flags(4, 5, 7))) for _ in range(5)]
-    assert turns == [[4], [5], [4], [5], [4]]
-
-
 @given(seed=SEEDS, bandwidth=st.integers(3, 8))
 def test_rotation_serves_every_request(seed, bandwidth):
     played = Played(MaskAction, bandwidth, COSTS)
@@ -126,15 +110,6 @@ def test_slots_are_as_many_as_there_may_be_queries_and_are_filled_up_and_cut():
     decision = played.decode([4, 5, 6, 7])
     assert decision.queried[0] @ COSTS == 4
     assert decision.n_dropped.tolist() == [2]
-
-
-def test_sequential_is_complete_when_nothing_fits_any_more():
-    played = Played(SequentialAction, 4, COSTS)
-    assert not played.decode(7).complete.any()
-    free = played.encoding.available(played.pending.picked)
-    assert np.flatnonzero(free[0]).tolist() == [0, 1, 2, 3]
-    assert indices(played.decode(2)) == [2, 7]
-    assert not played.pending.picked.any()
 
 
 @pytest.mark.parametrize(
@@ -192,13 +167,6 @@ def test_decode_undoes_encode(name, seed, bandwidth, differ):
     assert decision.n_dropped.tolist() == [0]
 
 
-@pytest.mark.parametrize("kind", [ScoresAction, SlotsAction, SequentialAction])
-def test_sets_that_an_encoding_cannot_ask_for_are_refused(kind):
-    for wanted in ((7,), (4, 5, 6)):  # too few, too many
-        with pytest.raises(ValueError, match="as much as the bandwidth of 4 pays for"):
-            Played(kind, 4, COSTS).encoding.encode(flags(*wanted)[None] > 0, flags()[None] > 0)
-
-
 @pytest.mark.parametrize(
     ("kind", "action", "message"),
     [
@@ -217,15 +185,3 @@ def test_bad_actions_are_refused_and_leave_no_trace(kind, action, message):
         played.decode(action)
     assert not played.pending.picked.any()
     assert played.pending.pointer.tolist() == [0]
-
-
-def test_episodes_of_a_batch_rotate_on_their_own():
-    encoding, pending = MaskAction(queries(2, EQUAL)), PendingPicks(3, 6)
-    everything = np.ones((3, 6), dtype=np.int8)
-    encoding.decode(np.array([1]), everything[:1], pending)
-    queried = encoding.decode(np.arange(3), everything, pending).queried
-    assert [np.flatnonzero(row).tolist() for row in queried] == [[0, 1], [2, 3], [0, 1]]
-    everything[0, 2:] = 0  # within the bandwidth: it is served, and its pointer stays
-    queried = encoding.decode(np.arange(3), everything, pending).queried
-    assert [np.flatnonzero(row).tolist() for row in queried] == [[0, 1], [4, 5], [2, 3]]
-    assert pending.pointer.tolist() == [2, 0, 4]
