@@ -171,10 +171,6 @@ def test_it_draws_the_chosen_episode_as_the_scalar_environment_does():
         ({"render_mode": "human"}, "render_mode must .* got 'human'"),
         ({"render_episode": 3}, r"render_episode must .* 0\.\.1, got 3"),
         ({"threads": 0}, r"threads must .* 1\.\.1024, got 0"),
-        (
-            {"estimator": "mhe", "estimator_settings": {"process_noise": [0.01, 0.0]}},
-            r"estimator_settings\.process_noise\[1\] must",
-        ),
     ],
 )
 def test_bad_keywords_name_themselves(keywords, message):

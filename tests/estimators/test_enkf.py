@@ -11,10 +11,10 @@ from dptse_env.estimators import (
 from dptse_env.estimators.enkf import gaspari_cohn, make_tapers
 from dptse_env.model import ARZModel
 from dptse_env.traffic import PAPER_HIGHWAY, SHORT_HIGHWAY
-from tests.helpers import make_channels, pairwise
+from tests.helpers import UNEVEN, make_channels, pairwise
 from tests.model.oracle import W99
 
-from .helpers import RELEASES, RICH, simulate, started, step
+from .helpers import RICH, simulate, started, step
 
 OPTIONS = {
     "rich": {name: getattr(RICH, name) for name in ("demand", "vehicle_noise", "flicker")},
@@ -25,12 +25,14 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize(
-    ("release", "bounds", "options"), pairwise(RELEASES[::-1], ["cone", "box"], OPTIONS)
+    ("release", "bounds", "options"),
+    pairwise(["rows", "uneven", "flow", "speed"], ["cone", "box"], OPTIONS, rest=False),
 )
 def test_it_takes_the_steps_of_its_reference(release, bounds, options):
     """Both draw the same numbers."""
     parameters = "published" if release == "speed" else "w99-3lane"
-    episodes = simulate(parameters, n=2, n_steps=25, release=release)
+    road = {"road": UNEVEN} if release == "uneven" else {"release": release}
+    episodes = simulate(parameters, n=2, n_steps=25, **road)
     settings = EstimatorSettings(bounds=bounds, **OPTIONS[options])
     compiled, reference = (started("enkf", each, episodes, settings) for each in BACKENDS)
     unit = compiled.model.state_scale
