@@ -14,8 +14,6 @@ from tests.helpers import UNEVEN, pairwise
 
 from .helpers import PLAIN, RICH, random_streams, run, simulate, started, step, update
 
-both_backends = pytest.mark.parametrize("backend", BACKENDS)
-
 
 def mhe_of(backend, episodes, start=None, settings=PLAIN, **own):
     return started("mhe", backend, episodes, replace(settings, mhe=HorizonSettings(**own)), start)
@@ -144,7 +142,7 @@ def test_poor_starts_under_ten_times_the_noise_are_solved(
     run(mhe, episodes, range(40), watch=check)
 
 
-@both_backends
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_an_exact_measurement_is_weighed_as_a_very_good_one(backend):
     episodes = simulate(n_steps=20)
     mhe = mhe_of(backend, episodes)
