@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from fractions import Fraction
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from dptse_env.traffic import (
     SHORT_HIGHWAY,
     Loops,
     Penetration,
+    RecordLibrary,
     Stations,
     readings,
 )
@@ -281,7 +283,26 @@ def nobody(generator, n_vehicles=1):
     return np.full((1, DURATION + 1), AWAY), np.zeros((1, DURATION + 1))
 
 
-TRIPS, OTHERS = (jumps, stands), (jumps, nobody)
+@cache
+def simulated():
+    """The vehicles of a record of SUMO, places and speeds (V, T + 1)."""
+    whole = RecordLibrary().get(SHORT_HIGHWAY, 0)
+    places = np.full((whole.n_vehicles, whole.n_steps), AWAY)
+    speeds = np.zeros(places.shape)
+    places[whole.vehicle, whole.step] = whole.segment
+    speeds[whole.vehicle, whole.step] = whole.speed
+    return places, speeds
+
+
+def drives(generator, n_vehicles=1):
+    """Vehicles of a record of SUMO, at a time when there are some."""
+    first = generator.integers(simulated()[0].shape[1] - DURATION)
+    places, speeds = (table[:, first : first + DURATION + 1] for table in simulated())
+    there = generator.permutation(np.flatnonzero((places != AWAY).any(axis=1)))[:n_vehicles]
+    return places[there], speeds[there]
+
+
+TRIPS, OTHERS = (jumps, stands, drives), (jumps, drives, nobody)
 
 
 def adjacent_trips(config, kinds, generator):
