@@ -283,6 +283,19 @@ def clipped_at_zero(card, weights):
 
 
 WRONG = {
+    "mask": [
+        (arguments(depth=3), "arguments must be layers, units, got"),
+        (arguments(layers=[12_000] * 3), r"must be at most 1\d*, got 2\d{8}$"),
+        (arguments(layers=[1] * 20_000), r"number must be .* got 20000"),
+        (arguments(layers=[0]), r"an integer >= 1, got 0"),
+        (arguments(layers={"pi": [1]}), "layers must be a list of widths"),
+        (arguments(units="Linear"), "units must be one of Tanh, ReLU"),
+        (lambda c, w: c.update(acts="both"), "acts must be one of deterministic, drawn"),
+        (lambda c, w: w.update({"normalisation.clip": np.ones(())}), "lacks the arrays normal"),
+        (clipped_at_zero, "clip and epsilon above 0"),
+        (lambda c, w: c["policy"].update({"class": "MaskableActorCriticPolicy"}),
+         "acts by action encoding 'sequential', got 'mask'"),
+    ],
     "slots": [
         (lambda c, w: c["fits"].update(format="dptse-policy-1"), "format is 'dptse-policy-1'"),
         (lambda c, w: c["fits"].update(action="x" * 10**5), r"action is 'x+\.\.\.x+' "),
@@ -296,18 +309,6 @@ WRONG = {
         (arguments(depth=3), "arguments must be reach, skips_sensors, width, got"),
         (lambda c, w: w.update(extra=np.zeros(2, "f4")), "it has the arrays extra"),
         (lambda c, w: w.pop("scorer.rule.weight"), "it lacks the arrays scorer.rule.weight"),
-    ],
-    "mask": [
-        (arguments(layers=[12_000] * 3), r"must be at most 1\d*, got 2\d{8}$"),
-        (arguments(layers=[1] * 20_000), r"number must be .* got 20000"),
-        (arguments(layers=[0]), r"an integer >= 1, got 0"),
-        (arguments(layers={"pi": [1]}), "layers must be a list of widths"),
-        (arguments(units="Linear"), "units must be one of Tanh, ReLU"),
-        (lambda c, w: c.update(acts="both"), "acts must be one of deterministic, drawn"),
-        (lambda c, w: w.update({"normalisation.clip": np.ones(())}), "lacks the arrays normal"),
-        (clipped_at_zero, "clip and epsilon above 0"),
-        (lambda c, w: c["policy"].update({"class": "MaskableActorCriticPolicy"}),
-         "acts by action encoding 'sequential', got 'mask'"),
     ],
 }  # fmt: skip
 
