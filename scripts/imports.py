@@ -25,7 +25,6 @@ from dptse_env.importers import Options, Source, Split, import_trajectories, rea
 from dptse_env.importers.fields import FieldRoad, FieldSource, import_field
 from dptse_env.importers.folder import ROAD, named_after
 from dptse_env.importers.report import REPORT, remarks
-from dptse_env.importers.road_file import write_road
 from dptse_env.importers.sumo_net import (
     PARAMETERS,
     Files,
@@ -39,6 +38,7 @@ from dptse_env.traffic import (
     is_road_file,
     ranges,
     read_road,
+    write_corridor,
 )
 from dptse_env.utils.files import require_output
 from dptse_env.utils.validation import require
@@ -280,7 +280,7 @@ class Network(RoadImport, Replacing):
         )
         description = road.description
         self.output.mkdir(parents=True, exist_ok=True)
-        write_road(self.road_file, road.corridor, comment="\n".join(description))
+        write_corridor(self.road_file, road.corridor, comment="\n".join(description))
         said = *description, f"road: {self.road_file}"
         seeds, keywords = {**KINDS, "test": KINDS["test"][:8]}, {"parameters": PARAMETERS}
         self.tell_road({"notes": road.remarks}, said, seeds, road.corridor, PAPER, keywords)

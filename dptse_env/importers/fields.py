@@ -22,13 +22,13 @@ from dptse_env.importers.folder import (
     require_new,
 )
 from dptse_env.importers.measured import with_measured
-from dptse_env.importers.road_file import write_road
 from dptse_env.importers.source import LENGTHS, SPEEDS, TIMES
 from dptse_env.importers.units import odd_unit
 from dptse_env.traffic.corridor import Conditions, Corridor, Scales
 from dptse_env.traffic.demand import Demand
 from dptse_env.traffic.imported import ranges, save_records
 from dptse_env.traffic.record import Record
+from dptse_env.traffic.roads import write_corridor
 from dptse_env.utils.arrays import AnyArray, BoolArray, FloatArray
 from dptse_env.utils.units import HOUR
 from dptse_env.utils.validation import (
@@ -534,7 +534,7 @@ def import_field(
         kept = save_records(folder, bare, records, sources, "fields")
         written = measured.replaced(recordings=kept)
         comment = "A measured field. Demand and average dwell are those of its first windows."
-        write_road(folder / ROAD, written, comment=comment)
+        write_corridor(folder / ROAD, written, comment=comment)
     return moved(written, output), seeds
 
 

@@ -20,13 +20,12 @@ from dptse_env.importers.measured import measure
 from dptse_env.importers.placing import Branches
 from dptse_env.importers.recording import Options, Recording
 from dptse_env.importers.report import write_report
-from dptse_env.importers.road_file import write_road
 from dptse_env.importers.source import Source
 from dptse_env.importers.tables import FORMATS
 from dptse_env.traffic.corridor import Corridor
 from dptse_env.traffic.imported import load_record, ranges, save_records
 from dptse_env.traffic.record import Record
-from dptse_env.traffic.roads import road_name
+from dptse_env.traffic.roads import road_name, write_corridor
 from dptse_env.utils.files import hidden, left_hidden, require_output
 from dptse_env.utils.validation import require, require_name
 
@@ -150,7 +149,7 @@ def import_trajectories(
         first = next(filter(None, seeds.values()))
         road = measure(recorded, lambda: (load_record(recorded, seed) for seed in first))
         comment = "Recorded traffic. Demand, exit shares and average dwell are measured."
-        write_road(folder / ROAD, road, environment, comment)
+        write_corridor(folder / ROAD, road, environment, comment)
         drawn = load_record(recorded, flat[0])
         report = write_report(folder, road, recordings, seeds, sources, drawn, notes)
     return Imported(moved(road, output), seeds, report)

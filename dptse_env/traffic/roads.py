@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 import re
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +38,9 @@ PARTS = ("action", "estimator", "observation", "privacy", "reward")
 let a file that somebody sent run code of the current folder."""
 _WITH_FOLDER = ("recordings", "sumo")
 _FILE_ENDINGS = (".json", ".safetensors")
+_WIDTH = 100
+_NUMBERS = re.compile(r"^(.*)\[\n((?: +[^\s\"'\[\]]+,\n)+) *\]", re.MULTILINE)
+_PAIRS = re.compile(r"^(.*)\[\n((?: +\[[^\n\"'\[\]]*\],\n)+) *\]", re.MULTILINE)
 
 
 _PAPER = Geometry(15, on_ramps=(3, 9), off_ramps=(6, 12), exit_shares=(0.1, 0.1))
@@ -190,6 +194,8 @@ def write_corridor(
 ) -> None:
     """Write a road file that `read_road` reads as the same corridor, completely or not at all.
 
+    Arrays of numbers stand in few lines.
+
     Args:
         path: The file; its folder exists.
         corridor: The road.
@@ -203,7 +209,22 @@ def write_corridor(
     if environment:
         content[_ENVIRONMENT] = _plain(dict(environment))
     head = "".join(f"# {line}\n" for line in comment.splitlines())
-    write_atomically(path, head + tomli_w.dumps(content))
+    tables = _PAIRS.sub(_joined, _NUMBERS.sub(_joined, tomli_w.dumps(content)))
+    write_atomically(path, head + tables)
+
+
+def _joined(found: re.Match[str]) -> str:
+    """Return an array in one line, or folded."""
+    before, body = found.groups()
+    entries = [line.strip().removesuffix(",") for line in body.splitlines()]
+    if len(line := f"{before}[{', '.join(entries)}]") < _WIDTH:
+        return line
+    whole = (entry.replace(" ", "\0") for entry in entries)
+    folded = textwrap.fill(
+        ", ".join(whole), _WIDTH, initial_indent="    ", subsequent_indent="    ",
+        break_long_words=False, break_on_hyphens=False,
+    )  # fmt: skip
+    return f"{before}[\n{folded},\n]".replace("\0", " ")
 
 
 def from_home(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> str:

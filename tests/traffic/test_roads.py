@@ -10,6 +10,7 @@ from dptse_env.registration import REGISTRIES
 from dptse_env.traffic import (
     CORRIDORS,
     PAPER_HIGHWAY,
+    Demand,
     DemandDistribution,
     randomised,
     read_corridor,
@@ -66,6 +67,19 @@ start = [100, 120]
         write_corridor(tmp_path / "road.toml", each, comment="a road\nin two lines")
         assert read_corridor(tmp_path / "road.toml") == each
         assert read_corridor(str(tmp_path / "road.toml")).digest == each.digest
+
+
+def test_a_road_file_has_an_array_in_few_lines(tmp_path):
+    path, rates = tmp_path / "road.toml", tuple((30.0 * k, 1000.0 + k) for k in range(40))
+    road = PAPER_HIGHWAY.replaced(
+        demand=Demand(rates, (100.0,) * len(PAPER_HIGHWAY.geometry.on_ramps))
+    )
+    write_corridor(path, road, {"query_spans": [1, 2]}, "a comment")
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert len(lines) < 60
+    assert 80 < max(map(len, lines)) <= 100
+    assert "query_spans = [1, 2]" in lines
+    assert read_corridor(path) == road
 
 
 def test_what_a_file_leaves_out_is_derived_from_the_road(road):
