@@ -701,11 +701,14 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> EnvConfig:
     inherited = (*_inherited(config, values, assumed), *made_for)
     if not inherited:
         return config
+    advice = [*made_for.values()]
+    if not all(each.startswith("estimator_settings") for each in inherited):
+        advice.append("`dptse fit` fits parameters to a road file")
+    if "estimator_settings" in inherited:
+        advice.append("`dptse fit --tune` tunes settings")
     warnings.warn(
         f"{', '.join(inherited)}: values measured or tuned on another road or with other "
-        "parameters, or assumed, or defaults that nobody tuned, are used; "
-        f"{''.join(f'{each}; ' for each in made_for.values())}`dptse fit` fits "
-        "parameters to a road file, `dptse fit --tune` tunes settings",
+        "parameters, or assumed, or defaults that nobody tuned, are used; " + "; ".join(advice),
         UserWarning,
         stacklevel=1,  # one place, so that Python tells it once, however environments are made
     )

@@ -353,13 +353,10 @@ def note_parameters(choice: Choice, fit: Fit) -> None:
 def chosen_keywords(choice: Choice, road: Road) -> dict[str, Any]:
     """Return the keywords of an environment that a fit has decided."""
     decided = {key: value for key, value in road.keywords.items() if key in road.decided}
-    chosen = choice.sets[choice.parameters]
-    if chosen.get("parameters") == road.inherited:
-        chosen = {}
     return {
         **decided,
         **road.fusion_of(choice.estimator),
-        **chosen,
+        **choice.sets[choice.parameters],
         "estimator": choice.estimator,
     }
 
@@ -377,7 +374,6 @@ def inherits(choice: Choice, keywords: Mapping[str, Any]) -> list[str]:
         f"{tuned_with(config.parameters)}"
     )
     said = {
-        "parameters": f"the parameters {config.parameters.name} were fitted to another road",
         "estimator_settings": f"{settings}: dptse fit --tune makes settings of your own",
         **config.made_for(),
     }

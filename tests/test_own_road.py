@@ -100,11 +100,11 @@ BEYOND = [
 
 
 def told_beyond(make):
-    """Return what a function makes, and its warnings that weights were trained on others."""
+    """Return what a function makes, and its warnings of weights, each part with its semicolon."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         made = make()
-    return made, [str(w.message) for w in caught if "was trained on" in str(w.message)]
+    return made, [f"{w.message};" for w in caught if "was trained on" in str(w.message)]
 
 
 @pytest.mark.parametrize(("name", "keywords", "value"), BEYOND)
@@ -183,10 +183,18 @@ def test_a_default_bandwidth_is_limited_to_the_road_and_a_given_one_is_not(tmp_p
 def test_a_configuration_names_what_is_not_of_the_road(tmp_path):
     path = tmp_path / "plain.toml"
     path.write_text("n_mainline = 5\nduration = 60\nlanes = 2\n[demand]\nmainline = [[0, 1500]]\n")
-    with pytest.warns(UserWarning, match="on another road"):
+    with pytest.warns(UserWarning, match="on another road") as told:
         env = gym.make(ID, corridor=str(path), traffic_seeds=[0], bandwidth=2)
     inherited = {"corridor.average_dwell", "parameters", "estimator_settings"}
     assert {*env.unwrapped.config.inherited} == inherited
+    assert "`dptse fit` fits" in str(told[0].message)
+    path.write_text(
+        f"average_dwell = 4.0\n{path.read_text()}[environment]\nparameters = 'published'"
+    )
+    with pytest.warns(UserWarning, match="^estimator_settings: ") as told:
+        gym.make(ID, corridor=str(path), traffic_seeds=[0], bandwidth=2)
+    assert "`dptse fit --tune` tunes" in str(told[0].message)
+    assert "`dptse fit` fits" not in str(told[0].message)
 
 
 MINE = {
