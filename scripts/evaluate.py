@@ -140,13 +140,15 @@ class Score:
     Attributes:
         means: By error, and of the squared errors over their reported variances.
         differences: By error, to the reference with this estimator, paired by traffic and noise.
-        estimator_differences: By error, to this policy with the estimator of its least error.
+        least: Estimator with which this policy errs least.
+        estimator_differences: By error, to this policy with that estimator.
     """
 
     estimator: str
     policy: str
     means: Mapping[str, Interval]
     differences: Mapping[str, Interval]
+    least: str
     estimator_differences: Mapping[str, Interval]
 
     @property
@@ -205,7 +207,7 @@ def compare(args: Args) -> None:
             "rows": [as_json(each) for each in scores],
         },
         f"{title}\n{notes}", make_table("", *header, left=2, rows=lines),
-        *policy_verdicts(rows, scores, cells), *estimator_verdicts(rows, scores),
+        *policy_verdicts(rows, scores, cells), *estimator_verdicts(scores),
         f"wrote {args.output}/: {TABLES}, {ERRORS} (errors), {MAPS} ({shown}){page}",
     )  # fmt: skip
 
@@ -266,6 +268,7 @@ def score(rows: pl.DataFrame, cells: Sequence[Cell], reference: str) -> list[Sco
             policy,
             {each: _interval(own) for each, own in found[estimator, policy].items()},
             differences((estimator, policy), (estimator, reference)),
+            least[policy],
             differences((estimator, policy), (least[policy], policy)),
         )
         for estimator, policy in names
@@ -377,23 +380,22 @@ def policy_verdicts(
     return lines
 
 
-def estimator_verdicts(rows: pl.DataFrame, scores: Sequence[Score]) -> list[str]:
+def estimator_verdicts(scores: Sequence[Score]) -> list[str]:
     """Return by how much other estimators err more than the best, a line for each policy."""
     lines = []
-    for policy in dict.fromkeys(each.policy for each in scores):
-        best, *others = sorted(
-            (each for each in scores if each.policy == policy), key=lambda each: each.error
-        )
-        if not others or best.means[ERROR].n == 1:
+    for best in scores:
+        others = [
+            each for each in scores if each.policy == best.policy and each.estimator != best.least
+        ]
+        if best.estimator != best.least or not others or best.means[ERROR].n == 1:
             continue
-        least = {"estimator": best.estimator, "policy": policy}
-        more = []
-        for each in others:
-            gain = below(rows, least | {"estimator": each.estimator}, least)
-            more.append(f"{each.estimator} {-gain.mean:.1f} ± {gain.half_width:.1f} %")
+        scale, more = 100.0 / best.error, []
+        for each in sorted(others, key=lambda each: each.error):
+            gap = each.estimator_differences[ERROR]
+            more.append(f"{each.estimator} {scale * gap.mean:.1f} ± {scale * gap.half_width:.1f} %")
         lines.append(
-            f"{policy}: {best.estimator} has the least error x 1000 ({best.error:.1f}); more by "
-            f"{', '.join(more)}"
+            f"{best.policy}: {best.estimator} has the least error x 1000 ({best.error:.1f}); more "
+            f"by {', '.join(more)}"
         )
     return lines
 
