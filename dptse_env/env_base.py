@@ -112,7 +112,11 @@ class QueryEnvBase:
         return self._process
 
     def guarantee(self) -> str:
-        """Return the guarantee of an episode in one line, or "none" with what voids it."""
+        """Return the guarantee of an episode in one line.
+
+        Its numbers are rounded up; `privacy` has all digits. Where there is none, it is "none" with
+        the names of what voids it, which `dptse_env.release.VOID_REASONS` explains.
+        """
         report = self.privacy()
         reasons = ", ".join(report["void_reasons"])
         return f"none: {reasons}" if reasons else str(report["guarantee"])

@@ -33,8 +33,8 @@ CAPPED, PACED = {"preset": "capped", "cap": 5}, {"preset": "paced", "epsilon": 0
 @pytest.mark.parametrize(
     ("privacy", "claim", "settings"),
     [
-        (CAPPED, "0.75032-Gaussian differential privacy, which is (1, 0.05)-", {"cap": 5}),
-        (PACED, "0.49184-Gaussian differential privacy, which is (0.5, 0.05)-", {"clip": 25.0}),
+        (CAPPED, ("0.75032", "(1, 0.05)"), {"cap": 5}),
+        (PACED, ("0.49184", "(0.5, 0.05)"), {"clip": 25.0}),
     ],
 )
 def test_what_is_spent_grows_up_to_the_guarantee(privacy, claim, settings):
@@ -43,7 +43,8 @@ def test_what_is_spent_grows_up_to_the_guarantee(privacy, claim, settings):
     account, infos = env.unwrapped.privacy(), [at_reset, *(step[4] for step in steps)]
     assert json.loads(json.dumps(account, allow_nan=False)) == account
     assert account["guarantee"] == env.unwrapped.guarantee()
-    assert account["guarantee"].startswith(claim)
+    stated = "{}-Gaussian differential privacy (rounded up), which is {}-differential privacy, of "
+    assert account["guarantee"].startswith(stated.format(*claim))
     assert account["void_reasons"] == []
     assert account.items() >= {"unit": "trip", "adjacency": "replace", **settings}.items()
     mus, epsilons = ([info[key] for info in infos] for key in ("spent_mu", "spent_epsilon"))

@@ -268,10 +268,10 @@ class CappedSettings(PrivacySettings):
     """Settings of `Capped`.
 
     Attributes:
-        unit: Unit of protection: ``trip``, a vehicle's trip, which counts in its first ``cap``
-            queried steps; ``event``, one second of a trip.
-        cap: Queried steps in which a vehicle counts, for the unit ``trip``; one of the length of an
-            episode leaves out none.
+        unit: Unit of protection: ``trip``, a vehicle's whole trip, which is counted in its first
+            ``cap`` observed seconds alone; ``event``, one second of a trip.
+        cap: Observed seconds in which a vehicle is counted, for the unit ``trip``; one of the
+            length of an episode leaves out none.
         adjacency: Difference of two adjacent records: ``replace`` or ``add_remove``.
         share: Part of the budget mu^2 for the density.
 
@@ -289,18 +289,19 @@ class CappedSettings(PrivacySettings):
 
     @property
     def contribution_cap(self) -> int | None:
-        """Queried steps in which a vehicle counts; None if it counts in all of them."""
+        """Observed seconds in which a vehicle is counted; None for all of them."""
         return self.cap if self.unit == "trip" else None
 
     def contributions(self, horizon: int) -> int:
-        """Return the most steps of ``horizon`` in which the protected unit can count."""
+        """Return the most seconds of ``horizon`` in which the protected unit can count."""
         return min(self.cap, horizon) if self.unit == "trip" else 1
 
     @property
     def protected(self) -> str:
         """Description of the protected data."""
         if self.unit == "trip":
-            return f"one vehicle's trip, which counts in {self.cap} queried steps"
+            until = f"the first {self.cap} seconds in which it is observed, then no more"
+            return f"one vehicle's whole trip (counted in {until})"
         return "one second of one vehicle's trip"
 
 

@@ -118,11 +118,11 @@ class PrivacyReport:
 
     def beside(self, loops: Loops) -> PrivacyReport:
         """Return what the report states beside loops: the same, given their readings."""
-        alone = f"; {ALONE}" if loops.least_count < 2 else ""
+        given = GIVEN_LOOPS + (f"; {ALONE}" if loops.least_count < 2 else "")
         return replace(
             self,
-            protects=f"{self.protects}, {GIVEN_LOOPS}{alone}",
-            guarantee="none" if self.guarantee == "none" else f"{self.guarantee}, {GIVEN_LOOPS}",
+            protects=f"{self.protects}, {given}",
+            guarantee="none" if self.guarantee == "none" else f"{self.guarantee}, {given}",
             details={**self.details, "loops": loops.fields()},
         )
 
