@@ -43,16 +43,17 @@ reproduce: setup  ## Write the reports of all studies anew, after playing what t
 
 CAPPED = --env 'dptse_env:dptse/PrivateHighway-v1 {"estimator": "ekf", "bandwidth": 5, "privacy": "capped"}'
 PACED = --env 'dptse_env:dptse/PrivateHighway-v1 {"estimator": "ekf", "bandwidth": 5}'
+IS_REJECTED = ; test $$? -eq 3
 audit: setup  ## Attack the privacy presets, 5,000 runs in each of two worlds or one run; results/audit.
-	$(BIN)/dptse audit --force --output results/audit/printed --env dptse_env:dptse/PaperHighway-v0 --target replaced
-	$(BIN)/dptse audit --force --output results/audit/corrected --env 'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected"}' --target replaced
-	$(BIN)/dptse audit --force --output results/audit/capped-weak $(CAPPED) --noise-factor 0.709
+	$(BIN)/dptse audit --force --output results/audit/printed --env dptse_env:dptse/PaperHighway-v0 --target replaced $(IS_REJECTED)
+	$(BIN)/dptse audit --force --output results/audit/corrected --env 'dptse_env:dptse/PaperHighway-v0 {"privacy": "corrected"}' --target replaced $(IS_REJECTED)
+	$(BIN)/dptse audit --force --output results/audit/capped-weak $(CAPPED) --noise-factor 0.709 $(IS_REJECTED)
 	$(BIN)/dptse audit --force --output results/audit/capped $(CAPPED)
-	$(BIN)/dptse audit --force --output results/audit/paced-weak $(PACED) --noise-factor 0.709
+	$(BIN)/dptse audit --force --output results/audit/paced-weak $(PACED) --noise-factor 0.709 $(IS_REJECTED)
 	$(BIN)/dptse audit --force --output results/audit/paced $(PACED)
 	$(BIN)/dptse audit --force --output results/audit/paced-replaced $(PACED) --target replaced
-	$(BIN)/dptse audit --force --output results/audit/printed-one-run --env dptse_env:dptse/PaperHighway-v0 --one-run
-	$(BIN)/dptse audit --force --output results/audit/paced-one-run-weak $(PACED) --one-run --noise-factor 0.5
+	$(BIN)/dptse audit --force --output results/audit/printed-one-run --env dptse_env:dptse/PaperHighway-v0 --one-run $(IS_REJECTED)
+	$(BIN)/dptse audit --force --output results/audit/paced-one-run-weak $(PACED) --one-run --noise-factor 0.5 $(IS_REJECTED)
 	$(BIN)/dptse audit --force --output results/audit/paced-one-run $(PACED) --one-run
 
 test: setup  ## Run the tests, without the slow ones.

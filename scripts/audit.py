@@ -1,6 +1,8 @@
 """Attack the privacy of an environment, and bound from below what its releases reveal.
 
 dptse audit --env dptse_env:dptse/ShortHighway-v0 --trials 100
+
+A rejected claim ends it with status 3.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ from dptse_env.versions import versions_with
 from scripts.cli import Command, Environment, Machines, Replacing, Seed, require_open
 
 RESULT = "audit.json"
+REJECTED = 3
+"""Status of an audit that rejects, unlike that of one that failed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,4 +77,7 @@ def main(args: Args) -> None:
     args.output.mkdir(parents=True, exist_ok=True)
     write_json(args.output / RESULT, found)
     said = f"the result is in {args.output / RESULT}"
-    args.answer(found, *finding.report(heading(env, keywords)), said)
+    title = f"{heading(env, keywords)}, estimator {config.estimator}"
+    args.answer(found, *finding.report(title), said)
+    if finding.verdict == "rejected":
+        raise SystemExit(REJECTED)

@@ -12,12 +12,17 @@ CAPPED = {"preset": "capped", "epsilon": 5.0, "cap": 16}
 
 
 def run(folder, privacy=CAPPED, **changes):
-    """Return the content of the only file that an audit leaves."""
-    env = f"{SHORT} {json.dumps({'privacy': privacy})}"
-    main(Args(**{"env": env, "trials": 150, "workers": 1, "output": folder / "out", **changes}))
+    """Return the content of the only file that an audit leaves, after a look at its status."""
+    env, status = f"{SHORT} {json.dumps({'privacy': privacy})}", 0
+    try:
+        main(Args(**{"env": env, "trials": 150, "workers": 1, "output": folder / "out", **changes}))
+    except SystemExit as end:
+        status = end.code
     (path,) = (folder / "out").iterdir()
     assert path.name == "audit.json"
-    return json.loads(path.read_text())
+    found = json.loads(path.read_text())
+    assert status == (3 if found["verdict"] == "rejected" else 0)
+    return found
 
 
 def test_a_guarantee_is_not_rejected_and_too_little_noise_is(tmp_path, capsys):
@@ -31,6 +36,7 @@ def test_a_guarantee_is_not_rejected_and_too_little_noise_is(tmp_path, capsys):
     noise = found["noise"]
     assert noise["p_value"] > 1e-3
     printed = capsys.readouterr().out
+    assert ", estimator ekf" in " ".join(printed.split())
     for number in (f"{mu:.3f}", f"{found['result']['mu']['value']:.3f}",
                    f"without any error, so many show a mu of {found['most']:.3f}\n", "cap 16",
                    f"noise: not rejected by {noise['n']} residuals", noise["suspect"]):  # fmt: skip
