@@ -355,7 +355,6 @@ def chosen_keywords(choice: Choice, road: Road) -> dict[str, Any]:
     decided = {key: value for key, value in road.keywords.items() if key in road.decided}
     return {
         **decided,
-        **road.fusion_of(choice.estimator),
         **choice.sets[choice.parameters],
         "estimator": choice.estimator,
     }

@@ -111,7 +111,6 @@ class Choice:
         keywords = {
             **self.road.keywords,
             "corridor": str(self.place.folder / PLAYED),
-            **self.road.fusion_of(labels["estimator"]),
             **{key: labels[key] for key in ("estimator", "bandwidth", "epsilon")},
             **self.sets.get(labels["parameters"], {}),
         }

@@ -87,12 +87,6 @@ class Road:
         """Traffic seeds of all kinds."""
         return tuple(seed for kind in KINDS for seed in self.seeds[kind])
 
-    def fusion_of(self, estimator: str) -> dict[str, Any]:
-        """Return the keyword ``fusion`` of an estimator, where the fit decides its dwell factor."""
-        if "fusion" not in self.decided:
-            return {}
-        return {"fusion": {**self.keywords.get("fusion", {}), **_dwell_factor(estimator)}}
-
     def cell(self, policy: str) -> Cell:
         """Return a query policy on the road, to be checked."""
         keywords = {**self.keywords, "corridor": str(self.path)}
@@ -137,11 +131,6 @@ class Road:
                 f"{self.path}: no vehicle is on the mainline in training traffic: give the road "
                 "demand, or recordings with vehicles"
             ) from problem
-
-
-def _dwell_factor(estimator: Any) -> dict[str, float]:
-    """Return the allowance for answers of the same vehicles that suits an estimator."""
-    return {"dwell_factor": 1.0 if estimator == "recurrent" else 0.0}
 
 
 def require_road(path: Path) -> None:
@@ -198,12 +187,6 @@ def find_road(path: Path, env: str, folder: Path, seeds: Mapping[str, str | None
     with quietly():
         more = {"corridor": str(path), "traffic_seeds": list(found["test"])}
         config = resolve(preset_of(env), {**keywords, **more})
-    if "fusion" not in given and not config.penetration.is_complete:
-        fusion, named = dict(keywords.pop("fusion", {})), road.environment.get("estimator")
-        if named and _dwell_factor(named).items() <= fusion.items():  # as a fit leaves it
-            del fusion["dwell_factor"]
-        keywords |= {"fusion": fusion} if fusion else {}
-        decided += ["fusion"] * ("dwell_factor" not in fusion)
     longer = f"more than the {WARM_UP} s that do not count"
     require(config.horizon_steps > WARM_UP, f"{path}: duration", longer, config.horizon_steps)
     return Road(

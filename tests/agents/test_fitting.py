@@ -424,29 +424,6 @@ def test_a_road_that_cannot_be_fitted_is_told_and_leaves_nothing(text, message, 
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(
-    ("table", "keywords", "factors"),
-    [
-        ("penetration = 0.3", "{}", (1.0, 0.0)),
-        ("penetration = 0.3\nfusion.speed_spread = 9", "{}", (1.0, 0.0)),
-        # What a fit has left is decided again; what somebody chose is not.
-        ('penetration = 0.3\nestimator = "recurrent"\nfusion.dwell_factor = 1', "{}", (1.0, 0.0)),
-        ("penetration = 0.3\nfusion.dwell_factor = 1", "{}", (1, 1)),
-        ("penetration = 0.3", '{"fusion": {"dwell_factor": 2}}', (2, 2)),
-        ("", "{}", (None, None)),
-    ],
-)
-def test_each_estimator_has_the_dwell_factor_that_suits_it(table, keywords, factors, tmp_path):
-    path = tmp_path / "my-road.toml"
-    path.write_text(f"{ROAD}\n[environment]\n{table}\n")
-    road = find_road(path, f"{ID} {keywords}", tmp_path, dict.fromkeys(KINDS))
-    choice = Choice(road, Place(tmp_path, this_process), {})
-    cells = (choice.cell(choice.labels("test", estimator=each)) for each in ("recurrent", "ekf"))
-    fusions = [cell.keywords.get("fusion", {}) for cell in cells]
-    assert tuple(each.get("dwell_factor") for each in fusions) == factors
-    assert all(each.get("speed_spread", 9) == 9 for each in fusions)
-
-
 def import_field(folder, windows):
     """Import a measured field of some windows of 100 s; return its road file."""
     rng = np.random.default_rng(0)
