@@ -51,13 +51,16 @@ def play_budgets(choice: Choice) -> Errors:
 def budget_table(errors: Errors) -> str:
     """Return a Markdown table of errors, a row for each bandwidth and a column for each epsilon.
 
-    The least error of a column is in bold.
+    The least error of a column is in bold. One that is larger than without queries says so.
     """
     bandwidths, epsilons = (sorted({*each}) for each in zip(*errors, strict=True))
     least = [_least(errors, epsilon) for epsilon in epsilons]
 
     def entry(bandwidth: int, epsilon: float) -> str:
-        text = interval(errors.get((bandwidth, epsilon)))
+        own, idle = (errors.get((each, epsilon)) for each in (bandwidth, 0))
+        text = interval(own)
+        if own is not None and idle is not None and is_less(idle, own):
+            text += ", worse than no queries"
         return f"**{text}**" if (bandwidth, epsilon) in least else text
 
     return markdown(

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 from matplotlib.figure import Figure
 
 from agents.environments import heading, release_in_words, settings_of
@@ -32,6 +33,8 @@ from dptse_env.utils.files import write_atomically
 
 PAGE, DIAGRAM, EPISODE = "fit.md", "speed-density.png", "episode.png"
 """Files in the folder of a fit."""
+TOO_SURE = 2.0
+"""Mean square of errors over reported deviations above which an estimator is too sure."""
 
 
 def write_page(
@@ -75,7 +78,8 @@ def write_page(
         choice_table(choice, "policy"),
         "## Errors on test traffic",
         f"Nothing was chosen on it. Errors leave out the first {WARM_UP} s. {intervals} χ² is the "
-        "mean square of errors over reported deviations: 1 is honest. "
+        f"mean square of errors over reported deviations: 1 is honest, above {TOO_SURE:g} the "
+        "estimator is too sure of itself. "
         f"Plain is an EKF with {choice.home} and a round robin.",
         table(choice, played),
         "## Traffic",
@@ -152,12 +156,17 @@ def choice_table(choice: Choice, what: str) -> str:
                 interval(choice.errors(labels)),
                 "-" if labels == best else against(choice, labels, best),
                 "no" if labels in unbeaten else "yes",
-                *(f"{each:.2f}" for each in chi2(choice.rows, labels)),
+                *honesty(choice.rows, labels),
             ]
         )
     parameters = ["parameters"] if what == "estimator" else []
     more = "against the least", "beaten", "χ² density", "χ² speed"
     return markdown([what, *parameters, error_label(ERROR), *more], body)
+
+
+def honesty(rows: pl.DataFrame, labels: Labels) -> list[str]:
+    """Return χ² of densities and of speeds, in words where the estimator is too sure."""
+    return [f"{each:.2f}{', too sure' * (each > TOO_SURE)}" for each in chi2(rows, labels)]
 
 
 def _sorted(choice: Choice, played: Sequence[Labels]) -> list[Labels]:
@@ -173,8 +182,7 @@ def table(choice: Choice, played: Sequence[Labels]) -> str:
             names = [f"**{name}**" for name in names]
         errors = [interval(values(choice.rows, labels, each)) for each in (ERROR, DENSITY, SPEED)]
         more = "-" if labels == choice.plain else against(choice, labels, choice.plain)
-        honesty = [f"{each:.2f}" for each in chi2(choice.rows, labels)]
-        body.append([*names, *errors, more, *honesty])
+        body.append([*names, *errors, more, *honesty(choice.rows, labels)])
     head = "parameters", "estimator", "policy", *map(error_label, (ERROR, DENSITY, SPEED))
     return markdown([*head, "against plain", "χ² density", "χ² speed"], body)
 

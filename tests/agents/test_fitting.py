@@ -10,6 +10,7 @@ from itertools import product
 
 import gymnasium as gym
 import numpy as np
+import polars as pl
 import pytest
 from scipy import stats
 
@@ -21,6 +22,7 @@ from agents.fitting import choice as choosing
 from agents.fitting import parameters as searching
 from agents.fitting.budget import NO_NOISE, advice, budget_table
 from agents.fitting.choice import ESTIMATORS_TRIED, Choice
+from agents.fitting.page import honesty
 from agents.fitting.parameters import fit_parameters, start_from
 from agents.fitting.road import find_road
 from agents.fitting.road_file import copy_of, write_choice
@@ -30,6 +32,7 @@ from agents.study import Place
 from dptse_env.model import load_parameters
 from dptse_env.model.parameters import write_parameters
 from dptse_env.traffic import RecordLibrary, read_road, write_corridor
+from dptse_env.versions import code_version
 from scripts.fit import Args, estimators_tried
 from tests.helpers import save_untrained
 from tests.scripts.commands import refused, run_command
@@ -139,6 +142,13 @@ def test_the_page_shows_what_was_compared_budgets_figures_and_commands(fitted):
     assert all(sum("**" in row[k] for row in rows) == 1 for k in range(1, 5))
 
 
+def test_the_page_says_where_an_estimator_is_too_sure():
+    row = {"estimator": "ekf", "traffic_seed": 0, "version": code_version()}
+    rows = pl.DataFrame([{**row, "chi2_density": 2.01, "chi2_speed": 2.0}])
+    said = honesty(rows, {"estimator": "ekf"})
+    assert said == ["2.01, too sure", "2.00"]
+
+
 ERRORS = {
     (0, 1.0): [80, 82, 84, 86], (0, 5.0): [80, 82, 84, 86],
     (1, 1.0): [79, 83, 84, 86], (1, 5.0): [60, 61, 62, 63],
@@ -154,6 +164,7 @@ def test_advice_says_where_queries_stop_paying_and_what_noise_costs():
     exact = {**errors, (2, NO_NOISE): np.full(4, 41.0)}
     assert "+102 % at ε = 1, +25 % at ε = 5" in advice(exact, 5.0)
     assert "| no queries | **83.0 ± 4.1** | 83.0 ± 4.1 | - |" in budget_table(exact)
+    assert "| 2 | 91.5 ± 2.1, worse than no queries | 51.5 ± 2.1 |" in budget_table(errors)
     assert budget_table(errors).endswith("| 4 | - | **51.2 ± 2.7** |")
     paid = {key: each for key, each in errors.items() if key[1] == 5.0}
     assert "At each of these ε queries pay" in advice(paid, 5.0)
