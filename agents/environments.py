@@ -15,7 +15,9 @@ from gymnasium.vector import AutoresetMode
 
 from dptse_env.config import KEYWORDS, PRESETS, EnvConfig
 from dptse_env.estimators.recurrent import weights_of
+from dptse_env.estimators.tuned import PUBLISHED
 from dptse_env.evaluation import require_in_step
+from dptse_env.model import available_parameters
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import rounded_up
 from dptse_env.registration import ENVIRONMENTS
@@ -176,11 +178,11 @@ def guarantee_of(env: str, keywords: Mapping[str, Any]) -> str:
 
 
 def settings_of(env: str, keywords: Mapping[str, Any]) -> str:
-    """Return the estimator's settings in force in words: the name of a set, or of weights."""
+    """Return the estimator's settings in force in words, with the name of a set, or of weights."""
     with quietly():
         config = make_config(env, keywords)
     if config.settings_name is not None:
-        return config.settings_name
+        return f"{_origin(config.settings_name)} ({config.settings_name})"
     if config.estimator == "recurrent":
         saved = weights_of(config.settings(), flows=config.releases_flow)
         return f"weights {saved.source}"
@@ -188,6 +190,17 @@ def settings_of(env: str, keywords: Mapping[str, Any]) -> str:
         return "defaults"
     given = keywords.get("estimator_settings", "those of the road file")
     return given if isinstance(given, str) else "its own"
+
+
+def _origin(name: str) -> str:
+    """Return in words what a shipped set was tuned for, which its name has piece by piece."""
+    rest = name.partition("-")[2]
+    parameters = next(each for each in available_parameters() if rest.startswith(f"{each}-"))
+    release, _, variant = rest.removeprefix(f"{parameters}-").partition("-")
+    if variant == PUBLISHED:
+        return f"as the paper has them, for {release}"
+    road = f" on {variant}" if variant else ""
+    return f"tuned with the parameters {parameters} for {release}{road}"
 
 
 ELSEWHERE = {"corridor.loops", "corridor.fixed_sensors", "penetration.share"}

@@ -54,13 +54,21 @@ def test_a_heading_names_each_condition(keywords, named):
 @pytest.mark.parametrize(
     ("keywords", "settings"),
     [
-        ({"estimator": "ekf"}, "ekf-w99-3lane-paced"),
+        (
+            {"estimator": "ekf"},
+            "tuned with the parameters w99-3lane for paced (ekf-w99-3lane-paced)",
+        ),
+        (
+            {"estimator": "ekf", "estimator_settings": "ekf-w99-3lane-paced-long-highway"},
+            "tuned with the parameters w99-3lane for paced on long-highway "
+            "(ekf-w99-3lane-paced-long-highway)",
+        ),
         ({"estimator": "recurrent"}, "weights highway-flows"),
         ({"estimator": "recurrent", "privacy": "corrected"}, "weights highway-speeds"),
         ({"estimator": "asm"}, "defaults"),
         (
             {"estimator": "ekf", "estimator_settings": "published"},
-            "ekf-w99-3lane-paced-published",
+            "as the paper has them, for paced (ekf-w99-3lane-paced-published)",
         ),
         ({"estimator": "ekf", "estimator_settings": {"noise_scale": [2.0, 2.0]}}, "its own"),
     ],
