@@ -446,12 +446,14 @@ def draw_traffic(args: Args, title: str, scores: Sequence[Score], cells: Sequenc
     seed = parse_seeds(args.test_seeds)[0]
     episodes = [watch(name, known[labels], seed, args.records) for name, labels in chosen.items()]
     history = episodes[0].history
-    maps = [RoadMap("true density", history.truth, history)]
-    for each in episodes:
+    maps, last = [RoadMap("true density", history.truth, history)], episodes[-1].history.queried
+    alike = all(np.array_equal(each.history.queried, last) for each in episodes)
+    for each, (estimator, policy) in zip(episodes, chosen.values(), strict=True):
         maps.append(estimate_map(each.history, each.row[DENSITY], f"{each.name}: estimate"))
         queried = each.history.queried
-        if each is episodes[-1] or not np.array_equal(queried, episodes[-1].history.queried):
-            maps.append(RoadMap(f"{each.name}: queried", queried, history))
+        if each is episodes[-1] or not np.array_equal(queried, last):
+            of = "" if alike or each.name == policy else f" with {estimator}"
+            maps.append(RoadMap(f"segments queried by {policy}{of}", queried, history))
     figure = draw_maps([maps])
     save_figure(figure, args.output / MAPS, f"{title}: seed {seed}, {common}")
     if args.html:

@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 from PIL import Image
 
+from agents.figures import draw_maps
 from agents.statistics import mean_interval
 from agents.study import read_rows
 from dptse_env.estimators.simple import RandomWalk
@@ -40,9 +41,10 @@ def test_tables_rows_figures_and_json_agree(tmp_path):
         ("random_walk", name, seed) for name in ("none", "round-robin") for seed in (2000, 2001)
     }
     tables = (tmp_path / "out" / "tables.md").read_text("utf-8")
-    assert ". Settings of random_walk: random_walk-published-printed." in tables
+    settings = "tuned with the parameters published for printed (random_walk-published-printed)"
+    assert f". Settings of random_walk: {settings}." in tables
     found = json.loads(run_command("evaluate", *words, "--force", "--json").stdout)
-    assert found["settings"] == {"random_walk": "random_walk-published-printed"}
+    assert found["settings"] == {"random_walk": settings}
     means = {}
     for row in found["rows"]:
         own = rows_of(tmp_path / "out", row["policy"])
@@ -165,7 +167,14 @@ def test_estimators_come_in_the_order_of_their_errors(tmp_path):
         assert row["estimator_differences"]["error"]["mean"] == pytest.approx(less)
 
 
-def test_estimators_of_a_single_policy_are_compared_with_the_best_one(tmp_path):
+def test_estimators_of_a_single_policy_are_compared_with_the_best_one(tmp_path, monkeypatch):
+    panels = []
+
+    def draw(columns):
+        panels.extend(columns[0])
+        return draw_maps(columns)
+
+    monkeypatch.setattr("scripts.evaluate.draw_maps", draw)
     words = ["--env", f'{SHORT} {{"horizon": 80}}', "--test-seeds", "2000:2003", "--workers", "1"]
     words += ["--policies", "none", "--estimators", "random_walk", "open_loop", "ekf"]
     words += ["--output", tmp_path]
@@ -183,6 +192,7 @@ def test_estimators_of_a_single_policy_are_compared_with_the_best_one(tmp_path):
     assert line in done.stdout
     assert done.stdout.count("against") == 3
     assert "(estimates and queries, none, traffic seed 2000)" in done.stdout
+    assert [each.title for each in panels if each.is_flags] == ["segments queried by none"]
 
 
 def test_every_estimator_whose_settings_nobody_tuned_is_told():
