@@ -24,6 +24,7 @@ ESTIMATE_COLOUR = "#0072b2"
 QUERY_COLOUR = "#d55e00"
 NO_QUERY_COLOUR = "#f2f4f7"
 LOOP_COLOUR = "#009e73"
+RAMP_COLOUR = "#666666"
 LIMIT_STEP = 10.0
 """Step in which the axis of errors grows [veh/km]."""
 SMOOTH_FROM = 500
@@ -45,6 +46,7 @@ class History:
         rmse: Density error over the mainline [veh/km], a number per second.
         title: Id or road, estimator, release model and bandwidth in words.
         loops: Places of stations of loops along the mainline [km].
+        ramps: Place of each ramp along the mainline [km], with its kind in words.
     """
 
     episode: int
@@ -57,6 +59,7 @@ class History:
     rmse: list[float] = field(default_factory=list)
     title: str = ""
     loops: tuple[float, ...] = ()
+    ramps: tuple[tuple[float, str], ...] = ()
 
     @classmethod
     def empty(cls, process: QueryProcess, episode: int = 0, name: str = "") -> History:
@@ -82,7 +85,11 @@ class History:
         title = f"{place}, estimator {estimator}, release {release},\n{queries}"
         scale = corridor.scales.density_scale
         loops = tuple(corridor.stations.positions.tolist())
-        return cls(episode, config.horizon_steps, lengths, scale, title=title, loops=loops)
+        kinds = {"on-ramp": corridor.geometry.on_ramps, "off-ramp": corridor.geometry.off_ramps}
+        ramps = tuple((sum(lengths[:face]), kind) for kind in kinds for face in kinds[kind])
+        return cls(
+            episode, config.horizon_steps, lengths, scale, title=title, loops=loops, ramps=ramps
+        )
 
     @property
     def road_length(self) -> float:
@@ -188,6 +195,9 @@ class Picture:
                 clip_on=False,
                 zorder=3,
             )
+        for place, kind in history.ramps:
+            axis.axvline(place, color=RAMP_COLOUR, linewidth=0.8, linestyle=":")
+            axis.text(place, 0.98 * top, kind, color=RAMP_COLOUR, fontsize=7, va="top")
         axis.set(xlim=(0.0, edges[-1]), ylim=(0.0, top))
         axis.set_xlabel("position along the road [km]", fontsize=8)
         axis.set_ylabel("[veh/km]", fontsize=8)

@@ -55,6 +55,19 @@ def test_a_picture_shows_the_episode_so_far():
     np.testing.assert_array_equal(picture, fresh.render())
 
 
+def test_loops_and_ramps_are_marked_where_they_stand():
+    env = make("rgb_array", loops={"positions": [0.0, 0.4], "ramps": [2]})
+    env.reset(seed=0)
+    env.render()
+    (profile, *_) = env.unwrapped.drawing._picture._canvas.figure.axes
+    names = [text.get_text() for text in profile.get_legend().get_texts()]
+    assert names == ["queried now", "true density", "estimate", "loops"]
+    (marks,) = (line for line in profile.lines if line.get_label() == "loops")
+    np.testing.assert_allclose(marks.get_xdata(), [0.0, 0.4, 0.2])
+    ramps = [(text.get_text(), pytest.approx(text.get_position()[0])) for text in profile.texts]
+    assert ramps == [("on-ramp", 0.2), ("off-ramp", 0.4)]
+
+
 def test_it_is_drawn_anew_every_kth_second_and_at_the_end():
     env = make("rgb_array", render_every=4, horizon=10)
     env.reset(seed=0)
