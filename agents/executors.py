@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from functools import partial
 from itertools import islice
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import loky
+from loky.backend import resource_tracker
 
 from dptse_env.tools import add_tools_path
 from dptse_env.traffic.recording import follow_parent, uninterrupted
@@ -106,14 +107,15 @@ def _in_processes(
     left, deaths = dict(enumerate(tasks)), 0
     while left:
         waiting, running = iter([*left.items()]), dict[Future[ResultT], int]()
-        pool = loky.get_reusable_executor(
-            workers,
-            timeout=IDLE,
-            initializer=_begin,
-            initargs=(os.getpid(), compiling_is_said.is_set()),
-            # Those of another folder would not find what is named from here.
-            env={"OMP_NUM_THREADS": "1", "PWD": str(Path.cwd())},
-        )
+        with _quiet_tracker():
+            pool = loky.get_reusable_executor(
+                workers,
+                timeout=IDLE,
+                initializer=_begin,
+                initargs=(os.getpid(), compiling_is_said.is_set()),
+                # Those of another folder would not find what is named from here.
+                env={"OMP_NUM_THREADS": "1", "PWD": str(Path.cwd())},
+            )
         try:
             while left:
                 # Ahead of results, so that no process waits for a task.
@@ -133,6 +135,19 @@ def _in_processes(
         except BaseException:
             pool.shutdown(kill_workers=True)
             raise
+
+
+@contextlib.contextmanager
+def _quiet_tracker() -> Iterator[None]:
+    """Let loky's resource tracker, if it starts now, remove what an interruption leaves unsaid.
+
+    It is a process of its own, which takes the interpreter's options.
+    """
+    sys.warnoptions.append(f"ignore::UserWarning:{resource_tracker.__name__}")
+    try:
+        yield
+    finally:
+        sys.warnoptions.pop()
 
 
 def _is_lost(future: Future[Any]) -> bool:

@@ -160,6 +160,12 @@ def test_what_still_runs_is_ended_where_another_fails_or_the_program_is_killed(t
             program.kill()
 
 
+def test_what_an_interruption_leaves_is_removed_without_a_word():
+    left = "import loky.backend.resource_tracker as own\nown.register('/left', 'semlock')"
+    command = [sys.executable, "-c", f"{PROGRAM}{left}", "1", "2"]
+    assert subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stderr == b""
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
