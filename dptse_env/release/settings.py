@@ -76,7 +76,7 @@ class PrivacySettings:
         """Return the sentence that states mu and (epsilon, delta), and what is protected."""
         against = "" if self.noise == "secure" else ", against whoever does not know the seed"
         return (
-            f"{rounded_up(mu)}-Gaussian differential privacy (rounded up), which is "
+            f"{rounded_up(mu, '.4g')}-Gaussian differential privacy (rounded up), which is "
             f"({rounded_up(self.epsilon)}, {rounded_up(self.delta)})-differential privacy, of "
             f"{quantities} together, for {protected}{against}"
         )

@@ -90,7 +90,7 @@ def test_the_file_has_the_choice_and_keeps_all_else(fitted):
     assert 3.0 < content["average_dwell"] < 10.0
     # SUMO drew the vehicles: they are nobody's, and the guarantee stands.
     assert "measured" not in content
-    assert gym.make(ID, corridor=str(path)).unwrapped.guarantee().startswith("2.1181-Gaussian")
+    assert gym.make(ID, corridor=str(path)).unwrapped.guarantee().startswith("2.119-Gaussian")
 
 
 def test_the_environment_has_the_set_of_the_file_by_its_name(fitted):

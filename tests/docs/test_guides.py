@@ -194,7 +194,7 @@ def test_an_audit_rejects_the_mechanism_of_the_page_and_not_a_sound_one(run_guid
 
 def test_the_page_on_the_guarantee_prints_its_tables(run_guide):
     printed, _ = run_guide("guarantee.md")
-    assert "2.1181-Gaussian differential privacy" in printed
+    assert "2.119-Gaussian differential privacy" in printed
     assert re.search(r"250 trips: mu 16\.134, epsilon 198\.1", printed)
 
 

@@ -294,7 +294,7 @@ def test_a_guarantee_is_claimed_for_its_unit_and_charged_until_its_cap(
     config = capped(unit=unit, adjacency=adjacency, share=share, boundary_inputs=boundary_inputs)
     found = privacy_report(config)
     assert found.void_reasons == ()
-    claim = "2.1181-Gaussian differential privacy (rounded up), which is (5, 0.05)-"
+    claim = "2.119-Gaussian differential privacy (rounded up), which is (5, 0.05)-"
     assert found.guarantee.startswith(claim)
     assert f"{found.protects}, against whoever does not know the seed" in found.guarantee
     cap = {"cap": 16} if unit == "trip" else {}

@@ -276,7 +276,7 @@ def test_the_report_says_what_is_guaranteed(unit, adjacency):
     mu = mu_of(5.0, 0.05)
     assert ("whole trip" in found.protects) == (unit == "trip")
     assert found.protects.endswith("or by none" if adjacency == "replace" else "removed")
-    claim = "2.1181-Gaussian differential privacy (rounded up), which is (5, 0.05)-"
+    claim = "2.119-Gaussian differential privacy (rounded up), which is (5, 0.05)-"
     assert found.guarantee.startswith(claim)
     assert f"{found.protects}, against whoever does not know the seed" in found.guarantee
     assert found.void_reasons == ()
