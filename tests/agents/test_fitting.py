@@ -207,9 +207,9 @@ def test_the_search_finds_the_least_error_says_where_it_ended_at_a_bound_and_tri
 
 
 def test_a_start_is_slowed_down_until_the_time_step_suits_short_segments(tmp_path):
-    path = tmp_path / "short.toml"
+    path = tmp_path / "my-road.toml"
     path.write_text(ROAD.replace("segment_length = 0.1", "segment_length = 0.04"))
-    corridor = read_road(path).corridor
+    corridor = road_in(tmp_path).corridor
     start = start_from(load_parameters("w99-3lane"), corridor, "mine")
     assert not searching.is_stable(load_parameters("w99-3lane"), corridor)
     assert searching.is_stable(start, corridor)

@@ -67,3 +67,11 @@ def test_the_finding_says_what_was_attacked(record):
             assert finding.verdict == "not rejected"
         target = findings[0].attack.target
         assert target.startswith("the reports of vehicle ") == (made is not setting)
+
+
+def test_the_distance_of_a_finding_is_the_largest_of_its_runs(record):
+    setting = small.paced("ekf")
+    distances = small.runs_of(setting, Planner(setting).choose(record, "deleted"), 20).distances
+    assert distances.max() > distances.min()
+    found = audit_environment(setting, record, "deleted", trials=20)
+    assert found.attack.distance == pytest.approx(distances.max(), rel=1e-12)

@@ -10,7 +10,7 @@ from agents.audit.statistics import (
     audit_coins,
     error_bound,
 )
-from dptse_env.privacy import epsilon_of, mu_of
+from dptse_env.privacy import epsilon_of
 
 
 def gaussian_scores(mu, n, seed):
@@ -60,13 +60,6 @@ def test_the_bound_of_one_run_covers(mu, n):
     assert np.median(bounds) > mu - 6.0 / math.sqrt(n)
 
 
-def test_few_canaries_reject_nothing():
-    # Even without an error at 10 of them, a rate of 26 % is possible.
-    result = one_run(20.0, 10, 0, claimed=2.118)
-    assert result.verdict == "not rejected"
-    assert result.mu.value == result.most < 2.118
-
-
 def test_the_bounds_rest_on_held_out_runs():
     # A threshold fitted to noise finds a difference in the half that it was fitted to.
     found = [
@@ -74,14 +67,6 @@ def test_the_bounds_rest_on_held_out_runs():
         for seed in range(100)
     ]
     assert sum(result.verdict == "rejected" for result in found) <= 11
-
-
-@pytest.mark.parametrize("mu", [mu_of(1.0, 0.05), mu_of(5.0, 0.05)])
-def test_a_claim_that_is_too_small_by_root_two_is_rejected(mu):
-    for seed in range(10):
-        result = audit(*gaussian_scores(math.sqrt(2.0) * mu, 5_000, seed), claim_at(mu))
-        assert result.verdict == "rejected"
-        assert mu < result.mu.value < math.sqrt(2.0) * mu * 1.02
 
 
 def test_both_bounds_follow_from_their_error_rates():
