@@ -8,7 +8,6 @@ import pytest
 
 from agents.environments import make_config
 from agents.statistics import mean_interval
-from agents.studies import guarantees
 from agents.studies.guarantees import (
     BASE,
     LADDER,
@@ -28,7 +27,6 @@ from dptse_env.schedules import make_schedule
 from tests.helpers import SHORT
 
 FOLDER = Path(__file__).parents[3] / "results" / "guarantees"
-PRINTED, BOTH = "`printed` noise", "`paced` − `capped`"
 
 
 @pytest.fixture(scope="module")
@@ -40,23 +38,6 @@ def line_of(text, start):
     """Return the numbers of the first line of a table that begins so."""
     line = next(line for line in text.splitlines() if line.startswith(f"| {start} |"))
     return [each.strip() for each in line[1:-1].split("|")]
-
-
-def test_the_tables_are_those_of_the_rows(rows, tmp_path, monkeypatch):
-    monkeypatch.setattr(guarantees, "FIGURES", {})
-    text = report(rows, tmp_path)
-    paced, capped = (
-        values(rows, paid(release=each).labels, DENSITY) for each in ("paced", "capped")
-    )
-    lines = [line_of(text, f"density RMSE [veh/km]: {each}") for each in ("`paced`", BOTH)]
-    expected = [format_interval(mean_interval(each)) for each in (paced, paced - capped)]
-    assert [line[4] for line in lines] == expected
-    assert line_of(text, "3. `paced`, EKF, `round-robin` (2)")[2] == expected[0]
-    error = values(rows, priced("ekf", "event", epsilon=20.0).labels, DENSITY)
-    assert line_of(text, "event")[-1] == format_interval(mean_interval(error))
-    # For ε = 5, by both releases, and by densities alone.
-    assert line_of(text, f"{PRINTED}: composed")[4] == "348"
-    assert line_of(text, f"{PRINTED}: met 64 times, at least")[4] == "215"
 
 
 def test_a_cell_that_was_not_played_is_a_dash(rows, tmp_path):
@@ -97,7 +78,7 @@ def test_every_cell_has_the_shipped_settings_of_its_estimator_and_release_model(
 
 
 def test_epsilon_is_that_of_the_sums_of_two_vehicles():
-    own = priced("ekf", PRINTED, epsilon=1.0)
+    own = priced("ekf", "`printed` noise", epsilon=1.0)
     config = make_config(own.env, own.keywords)
     density_std, speed_std = (each.noise_std for each in privacy_report(config).releases)
     # sqrt(2 C) vehicles on 100 m, by hand, and sqrt(2 C) speed limits.

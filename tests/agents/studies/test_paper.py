@@ -10,7 +10,6 @@ from agents.statistics import Interval
 from agents.studies import paper
 from agents.studies.paper import CELLS, SETTINGS, STUDY, judge, tables_of, with_times
 from agents.study import Place, read_rows, read_table, run
-from agents.tables import format_interval, mean, pick
 
 RESULTS = Path(__file__).parents[3] / "results" / "paper"
 
@@ -29,23 +28,6 @@ def entries(text, first):
     """Return the entries of the first table row that begins so."""
     line = next(line for line in text.splitlines() if line.startswith(f"| {first}"))
     return line.strip("| ").split(" | ")[1:]
-
-
-def test_tables_have_the_means_of_the_rows(rows, times):
-    text = tables_of(with_times(rows, times))
-    for entry, setting in zip(entries(text, "UKF"), SETTINGS, strict=True):
-        density = mean(rows, paper.labels_of("ukf", setting), "rmse_density")
-        assert entry.startswith(format_interval(density))
-    ours, published = (
-        np.stack([pick(rows, paper.labels_of(f"mhe{kind}", setting))["rmse_density"].to_numpy()
-                  for setting in SETTINGS])
-        for kind in ("", "-published")
-    )  # fmt: skip
-    more = (100.0 * (published / ours - 1.0)).mean(axis=1)
-    found = text.partition("than with ours [%]")[2]
-    told = [entry.split()[0] for entry in entries(found, "MHE: density")]
-    assert told == [f"{each:+.1f}" for each in more]
-    assert entries(text, "MHE: density")[:2] == ["least", "least"]
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,8 @@ from agents.filters.highways import KINDS
 from agents.filters.plan import FilterPlan
 from agents.filters.scenarios import ScenarioRanges
 from agents.studies import roads
-from agents.studies.roads import drawn, on_road, recorded
+from agents.studies.roads import drawn, recorded
 from agents.study import read_rows
-from agents.tables import pick
 from dptse_env.estimators import recurrent
 from dptse_env.importers.folder import ROAD
 from dptse_env.traffic import CORRIDORS, write_corridor
@@ -53,10 +52,6 @@ def test_drawn_roads_are_no_training_roads_and_have_all_filters():
     assert played == {*roads.ALL_FILTERS, "recurrent"}
 
 
-def test_all_roads_are_played():
-    assert {cell.labels["road"] for cell in roads.study().cells} == set(roads.ROADS)
-
-
 def test_weights_in_files_have_cells_of_their_own_which_follow_the_content(tmp_path):
     prefix = tmp_path / "mine"
     for kind in ("flows", "speeds"):
@@ -76,27 +71,6 @@ def test_weights_in_files_have_cells_of_their_own_which_follow_the_content(tmp_p
     Path(f"{prefix}-flows.safetensors").unlink()
     with pytest.raises(FileNotFoundError, match=r"weights must be .*mine"):
         roads.study([str(prefix)])
-
-
-def test_tables_have_the_numbers_of_the_rows(rows):
-    line = "six ramps", "paced"
-    errors = {
-        name: -1000.0 * pick(rows, on_road(*line, name))["reward"].mean() for name in roads.FILTERS
-    }
-    best = roads.best_filter(rows, *line)
-    assert errors[best] == min(errors.values())
-    network = pick(rows, on_road(*line, "recurrent"))
-    found = roads.gain(rows, "", *line)
-    own = -1000.0 * network["reward"].mean()
-    assert found.mean == pytest.approx(100.0 * (1.0 - own / errors[best]))
-    (entry,) = (
-        text
-        for text in roads.table_of(rows, "").splitlines()
-        if text.startswith("| six ramps, paced |")
-    )
-    assert all(f"| {each:.1f} ± " in entry for each in (*errors.values(), own))
-    assert f"| {found.mean:.1f} [" in entry
-    assert f"{network['chi2_density'].mean():.2f}, {network['chi2_speed'].mean():.2f} |" in entry
 
 
 def test_the_summary_is_the_mean_over_own_roads_that_were_played(rows):

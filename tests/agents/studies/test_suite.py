@@ -23,14 +23,11 @@ from agents.studies.suite.entries import (
     make_entry,
     read_entry,
     require_fair,
-    seeds_of,
 )
 from agents.studies.suite.scores import choose_rules, errors_of, score, seeds_to_see
 from agents.studies.suite.tasks import (
-    CALIBRATED,
     MARKS,
     PAPER_SCHEDULE,
-    REPAIRED,
     ROUND_ROBIN,
     RULES,
     TASKS,
@@ -129,9 +126,6 @@ def test_a_rule_is_fixed_by_validation_traffic(small):
     for task, rule in rules.items():
         means = {each: errors_of(small, make_cell(task, each, part=VALIDATION)) for each in FEW}
         assert means[rule].mean() == min(each.mean() for each in means.values())
-    worse = pl.when(pl.col("part") == VALIDATION, pl.col("policy") == rules["plain"])
-    changed = small.with_columns(reward=worse.then(-9.0).otherwise("reward"))
-    assert choose_rules(changed)["plain"] != rules["plain"]
     worse = pl.when(pl.col("part") != VALIDATION, pl.col("policy") == rules["plain"])
     assert choose_rules(small.with_columns(reward=worse.then(-9.0).otherwise("reward"))) == rules
     assert choose_rules(small.filter(pl.col("policy") != "static")) == {}
@@ -195,10 +189,6 @@ def test_a_file_names_policies_by_task(small, tmp_path):
     path.write_text(f'policies = "{__name__}:Peeking"\nsteps = 5_000\nparameters = 9')
     entry = make_entry([str(path)], list(SMALL))
     assert (entry.steps, entry.parameters, entry.track) == (5000, 9, "1 million")
-    with pytest.raises(FileNotFoundError, match="nobody"):
-        make_entry(["nobody.safetensors"], list(SMALL))
-    with pytest.raises(ValueError, match="'nobody' acts in no task"):
-        make_entry(["nobody"], list(SMALL))
 
 
 # Cheats.
@@ -297,22 +287,18 @@ def test_rows_of_another_policy_task_or_version_are_not_those_of_an_entry(
 def test_training_on_test_traffic_or_on_a_held_out_road_is_refused(small, tmp_path):
     from dptse_env.sb3 import save_policy
 
-    policy, config = untrained(estimator="random_walk", traffic_seeds="1990:2010")
-    about = {"env": SHORT, "keywords": {}, "figures": {}}
     path = tmp_path / "leak.safetensors"
-    save_policy(path, policy, config, training={"seed": 0}, **about)  # as the page has it
-    assert seeds_of(read_policy(path).card) == [range(1990, 2010)]
-    with pytest.raises(ValueError, match="test traffic, seed 2000"):
-        make_entry([str(path)], list(SMALL))
-    policy, config = untrained(estimator="random_walk")
     told = {"traffic seeds": "0..7", "validation seeds": "1000..1003, 2002"}
-    save_policy(path, policy, config, training=told, **about)
-    with pytest.raises(ValueError, match="test traffic, seed 2002"):
-        require_fair(str(path))
-    policy, config = untrained(estimator="random_walk", privacy="paced", corridor={"duration": 100})
-    save_policy(path, policy, config, training={}, **about)
-    with pytest.raises(ValueError, match="the road of 'paced', which is held out"):
-        require_fair(str(path))
+    for keywords, training, message in (
+        ({"traffic_seeds": "1990:2010"}, {"seed": 0}, "seed 2000"),  # as the page has it
+        ({}, told, "test traffic, seed 2002"),
+        (SMALL["paced"].keywords, {}, "the road of 'paced', which is held out"),
+    ):
+        policy, config = untrained(**{**keywords, "estimator": "random_walk"})
+        about = {"env": SHORT, "keywords": {}, "figures": {}, "training": training}
+        save_policy(path, policy, config, **about)
+        with pytest.raises(ValueError, match=message):
+            make_entry([str(path)], list(SMALL))
 
 
 def test_the_report_says_what_was_not_played(small, tmp_path):
@@ -321,24 +307,6 @@ def test_the_report_says_what_was_not_played(small, tmp_path):
     part = suite.report(small.filter(pl.col("policy") != "static"), tmp_path)
     assert "\n| static | - | - |" in part
     assert "\n| plain | " not in part.split("\n## ")[0]
-
-
-def test_a_repaired_filter_estimates_as_the_filter_does_and_is_honest():
-    given = {
-        "bandwidth": 1,
-        "parameters": "w99-3lane",
-        "estimator_settings": "ekf-w99-3lane-printed",
-    }
-    plain, repaired = (
-        play(
-            Cell(SHORT, ROUND_ROBIN, {**given, "estimator": each}, watchers=("honesty",)),
-            (2000, 2001),
-        )
-        for each in (CALIBRATED, REPAIRED)
-    )
-    for one, other in zip(plain, repaired, strict=True):
-        assert one["reward"] == other["reward"]
-        assert abs(np.log(other["chi2_density"])) < abs(np.log(one["chi2_density"]))
 
 
 # The suite itself.
