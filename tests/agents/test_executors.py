@@ -20,7 +20,6 @@ from agents.executors import (
     this_process,
 )
 from dptse_env.utils.kernels import compiling_is_said
-from dptse_env.utils.registry import MissingExtraError
 from tests.helpers import ROOT, wait_for
 
 
@@ -164,22 +163,3 @@ def test_what_an_interruption_leaves_is_removed_without_a_word():
     left = "import loky.backend.resource_tracker as own\nown.register('/left', 'semlock')"
     command = [sys.executable, "-c", f"{PROGRAM}{left}", "1", "2"]
     assert subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stderr == b""
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("local", 0), "workers must be .* got 0"),
-        (("local", 1.5), "workers must be .* got 1.5"),
-        (("local", 1, "auto"), "address must be .* got 'auto'"),
-    ],
-)
-def test_wrong_words_are_named(words, said):
-    with pytest.raises(ValueError, match=said):
-        make_executor(*words)
-
-
-def test_the_extra_is_named_where_ray_is_missing(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'dptse-env\[ray\]'"):
-        make_executor("ray", 1)

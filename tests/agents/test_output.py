@@ -83,15 +83,13 @@ def test_maps_stand_in_columns_with_one_bar(episode, tmp_path):
         RoadMap("queried", history.queried[::5], history, step=5),
     ]  # fmt: skip
     figure = draw_maps([column, column])
-    assert len(figure.axes) == 2 * 3 + 1
+    assert figure.get_figwidth() <= WIDTH
     titles = [axis.get_title(loc="left") for axis in figure.axes[:-1]]
     assert titles[::2] == titles[1::2] == [panel.title for panel in column]
-    image = figure.axes[0].images[0]
+    image, queried = figure.axes[0].images[0], figure.axes[4].images[0]
     np.testing.assert_array_equal(image.get_array(), np.array(history.truth).T)
-    assert image.get_clim() == (0.0, history.density_scale)
-    assert figure.axes[4].images[0].get_clim() == (0.0, 1.0)
-    assert image.get_extent()[:2] == [-0.5, len(history.truth) - 0.5]
-    assert figure.axes[4].images[0].get_extent()[0] == -2.5
+    assert (image.get_clim()[1], queried.get_clim()[1]) == (history.density_scale, 1.0)
+    assert (image.get_extent()[0], queried.get_extent()[0]) == (-0.5, -2.5)
     save_figure(figure, tmp_path / "deep" / "maps.png", "title")
     with Image.open(tmp_path / "deep" / "maps.png") as saved:
         assert saved.format == "PNG"
@@ -106,11 +104,6 @@ def test_errors_of_every_policy_are_drawn_from_top_to_bottom():
         assert [text.get_text() for text in axis.texts] == [f"{interval.mean:.1f}"] * 3
         assert [text.xy[1] for text in axis.texts] == [0.15, -0.15, -1.0]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ekf", "ukf"]
-
-
-def test_a_wide_figure_is_made_as_narrow_as_a_page():
-    assert make_figure(4.0, 3.0).get_size_inches().tolist() == [4.0, 3.0]
-    assert make_figure(2.0 * WIDTH, 3.0).get_size_inches().tolist() == [WIDTH, 0.8 * 3.0]
 
 
 def contrast(inks, page):

@@ -10,7 +10,6 @@ from agents.play import Cell
 from agents.policies import find_policy
 from dptse_env import sb3
 from dptse_env.policies import TRANSFERABLE
-from dptse_env.schedules import make_schedule
 from tests.helpers import ABOUT, SHORT, save_untrained, untrained
 from tests.hostile import edited
 
@@ -46,26 +45,12 @@ def test_its_environment_has_the_blocks_that_it_was_trained_on(tmp_path):
 
 
 def test_what_is_no_policy_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no saved policy 'nobody\.safetensors'"):
-        find_policy("nobody.safetensors")
     text = tmp_path / "text.zip"
     text.write_text("no weights")
     with pytest.raises(ValueError, match=r"text\.zip is no saved policy; dptse import policy"):
         find_policy(str(text))
-    with pytest.raises(ValueError, match=r"schedule must be one of .*, got 'nobody'"):
-        find_policy("nobody").load(gym.make(SHORT))
     with pytest.raises(FileNotFoundError, match=r"none\.zip"):
         find_policy("none.zip")
-
-
-def test_a_schedule_has_a_name():
-    schedule, env = find_policy("shift-ahead"), gym.make(SHORT)
-    assert (schedule.keywords, schedule.identity) == ({}, "shift-ahead")
-    assert schedule.is_schedule
-    observation, _ = env.reset(seed=0)
-    action, _ = schedule.load(env).predict(observation, None, None)
-    expected, _ = make_schedule("shift-ahead", env).predict(observation, None, None)
-    np.testing.assert_array_equal(action, expected)
 
 
 class Slots:

@@ -103,16 +103,10 @@ def test_a_killed_driver_goes_on(cluster, traces, tmp_path, expected):
     assert rows_of(tmp_path).equals(expected)
 
 
-@pytest.mark.parametrize("kind", ["nothing", "another server", "no port"])
-def test_an_address_without_a_cluster_is_an_error(ray, kind):
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler)
-    address = "127.0.0.1" if kind == "no port" else f"127.0.0.1:{server.server_port}"
-    with server:
-        if kind == "another server":
-            threading.Thread(target=server.serve_forever, daemon=True).start()
-        else:
-            server.socket.close()
-        with pytest.raises(ExecutorError, match=f"no Ray cluster answers at {address}:"):
-            make_executor("ray", 1, address)
-        if kind == "another server":
-            server.shutdown()
+def test_an_address_without_a_cluster_is_an_error(ray):
+    with http.server.HTTPServer(("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        for address in (f"127.0.0.1:{other.server_port}", "127.0.0.1:9", "127.0.0.1"):
+            with pytest.raises(ExecutorError, match=f"no Ray cluster answers at {address}:"):
+                make_executor("ray", 1, address)
+        other.shutdown()

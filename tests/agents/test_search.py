@@ -69,12 +69,6 @@ def test_the_search_holds_the_defaults_and_the_shipped_sets(estimator):
             assert from_mapping(EstimatorSettings, nested(values), "settings") == settings
 
 
-def test_values_become_nested_settings_of_four_digits():
-    values = {"process_noise.0": 0.0123456, "process_noise.1": 0.2, "mhe.bounds": "cone"}
-    settings = {"process_noise": [0.01235, 0.2], "mhe": {"bounds": "cone"}}
-    assert nested({**values, "speed_cap": None}) == {**settings, "speed_cap": None}
-
-
 def test_bounds_of_the_search_are_seen():
     knob, options = evenly(1e-3, 1e-1), CategoricalDistribution((1, 2))
     values = (1e-3, 1.09e-3, 1.2e-3, 8e-2, 9.2e-2, 1e-1)
@@ -199,10 +193,3 @@ def test_settings_can_be_tuned_for_a_saved_policy(tmp_path):
     assert one.study_name != other.study_name
     shutil.copy(files[0], files[1])
     assert one.study_name == other.study_name  # by content, not by name
-
-
-def test_what_cannot_be_tuned_is_named():
-    with pytest.raises(ValueError, match=r"estimators must be one of ekf, .*, got 'open_loop'"):
-        search_space("open_loop")
-    with pytest.raises(ValueError, match="also must leave out demand"):
-        search_space("random_walk", ("demand",))

@@ -152,12 +152,6 @@ def test_every_round_tries_other_swaps_in_other_episodes(round_of_swaps):
     assert max(seeds + other_seeds) < training_seed(SEED + 1)
 
 
-def test_without_budgets_nothing_is_spent():
-    swaps = tried("printed")[1]
-    assert not swaps.spent.any()
-    assert swaps.gain.any()
-
-
 # --- the fit --------------------------------------------------------------------------------------
 
 STEP = 3.0
