@@ -1,6 +1,5 @@
 """All commands: their help and its examples, the status of a run, and bad input in one line."""
 
-import contextlib
 import errno
 import io
 import json
@@ -24,7 +23,7 @@ from dptse_env import command_line
 from dptse_env.traffic import RecordingError
 from dptse_env.utils.registry import EXTRAS
 from dptse_env.versions import code_version
-from scripts import dptse, info
+from scripts import info
 from scripts.dptse import MODULES
 from tests.helpers import ROOT, SHORT, save_untrained
 from tests.importers.data import plain, stream
@@ -50,6 +49,7 @@ def help_of(name):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_begins_with_an_example_and_fits_a_screen(name):
     page = help_of(name)
+    assert name == "import" or {"--json", "--quiet"} <= {*re.findall(r"--[a-z]+", page)}
     head = page.partition("╭")[0]
     assert re.search(rf"^dptse {name}\b", head, re.MULTILINE)
     lines = page.splitlines()
@@ -98,29 +98,10 @@ def test_the_overview_has_every_command_and_fits_a_terminal():
     assert max(map(len, lines)) <= 80
     for name in MODULES:
         assert re.search(rf"^.{{16}}{name} ", overview, re.MULTILINE)
-    assert run_command().stdout == overview
-    assert run_command("--version").stdout == f"dptse {dptse_env.__version__}\n"
-
-
-def test_help_on_a_command_is_that_of_the_command():
-    assert run_command("help").stdout == run_command("--help").stdout
-    assert run_command("help", "record").stdout == run_command("record", "--help").stdout
+    assert run_command().stdout == run_command("help").stdout == overview
     words = "import", "field"
     assert run_command("help", *words).stdout == run_command(*words, "--help").stdout
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
-def test_the_line_is_the_same_where_stdout_lacks_letters(encoding, monkeypatch):
-    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
-    with contextlib.redirect_stderr(io.StringIO()) as err, pytest.raises(SystemExit):
-        dptse.main(["record", "--workers"])
-    assert err.getvalue() == "error: Missing value for argument '--workers'. Expected 1 values\n"
-
-
-def test_every_command_can_be_quiet_and_can_print_json():
-    for name in COMMANDS:
-        if name != "import":
-            assert {"--json", "--quiet"} <= {*re.findall(r"--[a-z]+", help_of(name))}
+    assert run_command("--version").stdout == f"dptse {dptse_env.__version__}\n"
 
 
 def test_a_quiet_command_prints_json_alone_and_silences_nothing_after_it(caplog):
@@ -204,11 +185,10 @@ def test_information_has_what_a_bug_report_needs():
     found = json.loads(run_command("info", "--json").stdout)
     assert wanted <= set(found["packages"])
     page = run_command("info").stdout
-    for value in (code_version(), found["packages"]["numpy"]):
-        assert value in page
+    assert code_version() in page
+    assert found["packages"]["numpy"] in page
     for kept in ("records", "kernels"):
         assert re.search(rf"^{kept}: \d+ files, [\d.]+ MB in /", page, re.MULTILINE)
-    assert len(page.splitlines()) <= 24
 
 
 @pytest.mark.parametrize(
