@@ -1,7 +1,4 @@
-"""Links of the pages beside the site lead somewhere; all files state the same release.
-
-The links of the site are checked where it is built, by ``docs/_site/links.py``.
-"""
+"""Links of pages lead somewhere; all files state the same release."""
 
 import pkgutil
 import re
@@ -77,30 +74,22 @@ def test_the_page_on_architecture_has_every_command_with_its_modules():
 
 
 @pytest.mark.skipif(not (ROOT / "results").is_dir(), reason="a source archive has no results")
-def test_links_lead_somewhere(tmp_path):
-    found = {page.relative_to(ROOT).as_posix(): list(broken(page)) for page in PAGES}
-    assert {page: links for page, links in found.items() if links} == {}
-    page = tmp_path / "page.md"
-    page.write_text("# A b: c\n[a](#a-b-c) [b](#no) [c](page.md#a-b-c) [d](no.md) `[e](code.md)`\n")
-    assert list(broken(page)) == ["#no", "no.md"]
+def test_links_lead_somewhere():
+    pages = [*PAGES, *(ROOT / "docs").rglob("*.md")]
+    assert [(page, link) for page in pages for link in broken(page)] == []
 
 
 def test_the_site_is_refused_with_dead_links_and_with_files_of_other_hosts(tmp_path):
     (tmp_path / "page.html").write_text(
-        '<h1 id="ε">A</h1> <a href="#%CE%B5">a</a> <a href="#no">b</a> <img src="no.png">'
+        '<h1 id="ε">A</h1> <a href="/page.html#%CE%B5">a</a> <a href="#no">b</a>'
         '<a href="https://far.example">c</a> <script src="https://far.example/c.js"></script>'
-    )
-    (tmp_path / "404.html").write_text(
-        '<a href="/page.html#ε">d</a> <a href="/no.html">e</a>', "utf-8"
     )
     (tmp_path / "a.css").write_text("a {b: url(https://far.example/d.woff)} c {d: url(e.png)}")
     problems = runpy.run_path(str(ROOT / "docs" / "_site" / "links.py"))["problems"]
     assert sorted(problems(tmp_path)) == [
-        "404.html: /no.html does not exist",
         "a.css: fetches https://far.example/d.woff",
         "page.html: #no is no anchor",
         "page.html: fetches https://far.example/c.js",
-        "page.html: no.png does not exist",
     ]
 
 
@@ -136,11 +125,6 @@ def test_the_paper_has_its_sections_and_cites_what_its_bibliography_has():
     assert 750 <= len(text.split()) <= 1_100
     keys = re.findall(r"^@\w+\{(\w+),$", bibliography, re.MULTILINE)
     assert sorted(keys) == sorted(set(re.findall(r"@(\w+)", text)))
-    entries = re.split(r"^@\w+", bibliography, flags=re.MULTILINE)[1:]
-    address = re.compile(r"^  (doi = \{10\.\d{4,}/\S+|url = \{http\S+)\},?$", re.MULTILINE)
-    # One conference paper has an identifier that we could not verify.
-    assert [each[1:12] for each in entries if not address.search(each)] == ["andre2017en"]
-    assert all(each.count("{") == each.count("}") for each in entries)
     authors = citation.partition("\nreferences:")[0].partition("\nauthors:")[2]
     names = re.findall(r"- name: (.*)", authors)
     assert names
