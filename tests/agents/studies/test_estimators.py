@@ -3,12 +3,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import polars as pl
-import pytest
 
 from agents.studies import estimators as study
-from agents.studies.estimators import sensed
 from agents.study import read_rows
-from dptse_env.privacy import mu_of
 
 RECORDED = Path(__file__).parents[3] / "results" / "estimators"
 
@@ -26,21 +23,6 @@ def test_what_was_not_played_is_a_dash_and_no_figure(tmp_path):
     assert "| paced, EKF | ε = 5, δ = 0.05 | - | - | - | - | - |" in lines
     assert [path.name for path in tmp_path.glob("*.png")] == ["fig_elsewhere.png"]
     assert (tmp_path / "fig_elsewhere.png").stat().st_size > 10_000
-
-
-def test_sensors_alone_have_the_budget_that_they_are_said_to_have():
-    def mu_by_group(labels):
-        cell = study.sensed_cell(labels)
-        report = gym.make(cell.env, **cell.keywords).unwrapped.privacy()
-        return {group["group"]: group["mu"] for group in report["groups"]}
-
-    whole = mu_of(study.EPSILON, 0.05)
-    part = whole / np.sqrt(1.0 + 3.0 * np.sqrt(study.BASE_SHARE))
-    assert mu_by_group(study.alone("paced", "ekf"))["sensors"] == pytest.approx(whole)
-    assert mu_by_group(study.alone("paced", "ekf", study.PART))["sensors"] == pytest.approx(part)
-    queries = sensed("paced", "ekf", sensors=study.QUERIES)
-    assert mu_by_group(queries) == {"queries": pytest.approx(whole)}
-    assert study.alone("printed", "ekf") == study.alone("printed", "ekf", study.PART)
 
 
 def test_straight_lines_join_the_last_readings():

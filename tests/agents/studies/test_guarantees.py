@@ -9,10 +9,6 @@ import pytest
 from agents.environments import make_config
 from agents.statistics import mean_interval
 from agents.studies.guarantees import (
-    BASE,
-    LADDER,
-    SETTINGS_OF_EXACT,
-    all_cells,
     met_epsilon,
     paid,
     priced,
@@ -20,7 +16,6 @@ from agents.studies.guarantees import (
 )
 from agents.study import read_rows
 from agents.tables import DENSITY, format_interval, values
-from dptse_env.estimators import EstimatorSettings
 from dptse_env.parts import privacy_report
 from dptse_env.privacy import epsilon_of
 from dptse_env.schedules import make_schedule
@@ -56,25 +51,6 @@ def test_a_cell_that_was_not_played_is_a_dash(rows, tmp_path):
     # What a cell guarantees is known without playing it; true boundary inputs void it.
     lines = ("EKF, private", "EKF, true", "11. no noise, EKF, `round-robin` (3)")
     assert [line_of(text, each)[1] for each in lines] == ["ε = 5, δ = 0.05", "none", "none"]
-
-
-def test_every_rung_differs_in_one_thing_from_the_one_that_it_is_held_against():
-    rungs = [BASE | changes for _, changes, _ in LADDER]
-    for number, (label, _, base) in enumerate(LADDER, 1):
-        assert label.startswith(f"{number}. ")
-        own, other = rungs[number - 1], rungs[base - 1]
-        assert sum(own[name] != other[name] for name in BASE) == (base != number), label
-
-
-def test_every_cell_has_the_shipped_settings_of_its_estimator_and_release_model():
-    for cell in all_cells():
-        estimator, release = cell.keywords["estimator"], cell.keywords["privacy"]["preset"]
-        if release.endswith(":Exact"):  # tuned for it
-            assert cell.config.settings() == EstimatorSettings(**SETTINGS_OF_EXACT)
-            continue
-        assert "estimator_settings" not in cell.keywords
-        expected = None if estimator == "open_loop" else f"{estimator}-w99-3lane-{release}"
-        assert cell.config.settings_name == expected
 
 
 def test_epsilon_is_that_of_the_sums_of_two_vehicles():

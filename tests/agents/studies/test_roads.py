@@ -3,7 +3,6 @@ from pathlib import Path
 
 import pytest
 
-from agents.environments import make_config, quietly
 from agents.filters.highways import KINDS
 from agents.filters.plan import FilterPlan
 from agents.filters.scenarios import ScenarioRanges
@@ -21,21 +20,6 @@ WEIGHTS = Path(recurrent.__file__).parent / "weights"
 @pytest.fixture
 def rows():
     return read_rows("roads", RECORDED)
-
-
-def test_own_roads_are_others_and_their_filters_are_calibrated():
-    with quietly():
-        configs = {
-            name: make_config(road.env, {**road.parts[0][0], "estimator": "ekf"})
-            for name, road in roads.OWN.items()
-        }
-    digests = {config.corridor.digest for config in configs.values()}
-    assert len(digests) == 14
-    assert make_config(roads.PRIVATE, {}).corridor.digest not in digests
-    assert {config.settings_name for config in configs.values()} == {"ekf-w99-3lane-paced"}
-    assert configs["two lanes, 80 km/h"].corridor.scales.density_scale == pytest.approx(222.0)
-    assert configs["night, 300 veh/h"].corridor.conditions.incident is None
-    assert len(roads.KEPT_BACK) == 4
 
 
 def test_drawn_roads_are_no_training_roads_and_have_all_filters():
