@@ -14,7 +14,6 @@ from agents.tables import (
     difference,
     grid,
     mean,
-    narrow,
     pick,
     values,
 )
@@ -165,18 +164,6 @@ def test_an_id_says_all_that_rows_depend_on(tmp_path):
     # Weights of the package by their own name go with their digest.
     keywords = {"estimator_settings": {"recurrent": {"weights": "highway-flows"}}}
     assert read_weights("highway-flows").card["sha256"] in replace(first, keywords=keywords).id
-
-
-def test_wide_tables_are_cut_and_share_their_first_column():
-    wide = grid("", ["a", "b"], list("tuvwxyz"), lambda row, at: f"{row}{at}" if row == "a" else "")
-    first, second = narrow(wide).split("\n\n")
-    assert first.splitlines()[::2] == ["|  | t | u | v | w |", "| a | at | au | av | aw |"]
-    assert second.splitlines()[0] == "|  | x | y | z |"
-    assert second.splitlines()[1:] == [
-        "| --- | :-: | :-: | :-: |", "| a | ax | ay | az |", "| b |  |  |  |"
-    ]  # fmt: skip
-    text = "# A\n\n" + grid("", ["a"], list("vwxyz"), lambda *at: "1") + "\n\nMore."
-    assert narrow(text) == text
 
 
 def test_pairs_are_of_equal_numbers(monkeypatch):

@@ -7,18 +7,10 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from agents.training.plan import fitting
-from agents.training.settings import ALGORITHMS, TABLE, parse_algorithm
+from agents.training.settings import ALGORITHMS, parse_algorithm
 from dptse_env.config import resolve
-from dptse_env.utils.validation import read_toml
 from tests.agents.training.plans import ENV, ONE, OTHER, make_algorithm, make_plan
 from tests.helpers import SHORT, SumRelease
-
-
-def test_the_table_has_every_algorithm_and_says_what_each_value_is():
-    assert [*read_toml(TABLE, "table")] == [*ALGORITHMS]
-    lines = TABLE.read_text(encoding="utf-8").splitlines()
-    known = {line.split()[0] for line in lines if " = " in line and "  # " in line}
-    assert {line.split()[0] for line in lines if " = " in line} - known == {"like", "segments"}
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

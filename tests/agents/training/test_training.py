@@ -27,7 +27,6 @@ from agents.training.training import train, train_all
 from dptse_env.evaluation import evaluate
 from dptse_env.sb3 import ReplicaBaseline, load_policy
 from dptse_env.utils.files import read_tensors
-from tests.agents.elsewhere import elsewhere
 from tests.agents.training.plans import (
     ENV,
     ONE,
@@ -39,7 +38,6 @@ from tests.agents.training.plans import (
     make_algorithm,
     make_plan,
     stop,
-    without_time,
 )
 from tests.helpers import SHORT, fast_and_slow
 from tests.test_non_interference import blind, make_private, unlike
@@ -61,13 +59,6 @@ def whole(tmp_path_factory):
         return done[name, *changes]
 
     return get
-
-
-def assert_alike(folder, other):
-    for name in (*POLICIES, PLAN):
-        assert (folder / name).read_bytes() == (other / name).read_bytes(), name
-    curves = [without_time(read_progress(each)) for each in (folder, other)]
-    assert curves[0] == curves[1]
 
 
 # --- going on -------------------------------------------------------------------------------------
@@ -290,20 +281,6 @@ def test_damaged_and_foreign_files_are_refused(whole, tmp_path):
 
 
 # --- several trainings ----------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_trainings_at_once_come_out_as_alone(whole, tmp_path):
-    """One of them goes on where a worker was lost, whose task is run again."""
-    with pytest.raises(StopError), ended_at(1, stop):
-        train(make_plan(seed=2), tmp_path / "2")
-    rows = read_progress(tmp_path / "2")
-    plans = {tmp_path / str(seed): make_plan(seed=seed) for seed in (1, 2)}
-    train_all(plans, elsewhere)
-    assert_alike(tmp_path / "1", whole()[0])
-    assert read_progress(tmp_path / "2")[: len(rows)] == rows
-    first, second = (read_checkpoint(folder)["policy"] for folder in plans)
-    assert not any(torch.equal(first[key], second[key]) for key in first)
 
 
 def apart(work, tasks):
