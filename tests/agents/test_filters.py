@@ -1,6 +1,7 @@
 """Scenarios, what is collected of them, the network with gradients, and its training."""
 
 import dataclasses
+import hashlib
 import json
 from itertools import product
 
@@ -11,7 +12,7 @@ torch = pytest.importorskip("torch")
 
 from agents.environments import make_config, make_vector  # noqa: E402
 from agents.filters.collecting import Batch, collect, draw_batch  # noqa: E402
-from agents.filters.highways import KINDS, LENGTHS, LIMITS, draw_highway  # noqa: E402
+from agents.filters.highways import KINDS, draw_highway  # noqa: E402
 from agents.filters.network import RecurrentNetwork, second_loss, teacher_loss  # noqa: E402
 from agents.filters.plan import OWN, FilterPlan, Round, played_by  # noqa: E402
 from agents.filters.scenarios import (  # noqa: E402
@@ -108,47 +109,12 @@ def test_every_scenario_is_an_environment_and_every_road_another_one():
 # Sections -----------------------------------------------------------------------------------------
 
 
-def test_highways_differ_in_everything_that_roads_differ_in():
-    highways = [draw_highway(number).corridor for number in range(100)]
-    lanes = {count for each in highways for count in each.geometry.segment_lanes}
-    assert lanes == set(range(1, 7))
-    limits, lengths = (
-        [value for each in highways for value in getattr(each.geometry, name)]
-        for name in ("speed_limits", "segment_lengths")
-    )
-    assert (min(limits), max(limits)) == (60.0, 130.0)
-    assert LENGTHS[0] <= min(lengths) < 0.06
-    assert 0.2 < max(lengths) <= LENGTHS[1]
-    assert {each.conditions.drivers.model for each in highways} == {"W99", "IDM", "Krauss"}
-    assert {0, 6} <= {each.geometry.n_ramps for each in highways}
-    for name in ("on_ramps", "off_ramps"):
-        assert len({len(getattr(each.geometry, name)) for each in highways}) > 3
-    demands = [each.conditions.published_demand.mainline for each in highways]
-    assert min(rate for each in demands for _, rate in each) < 300.0
-    assert draw_highway(3) == draw_highway(3) != draw_highway(4)
-
-
-def test_highways_of_other_kinds_are_what_they_are_called():
-    drawn_ones = {kind: [draw_highway(number, kind) for number in range(60)] for kind in KINDS[1:]}
-    roads = {kind: [each.corridor for each in found] for kind, found in drawn_ones.items()}
-    assert max(road.conditions.vehicle_classes[-1].share for road in roads["lorries"]) > 0.35
-    limits = {each.limit for each in drawn_ones["lorries"]}
-    assert {100.0, 130.0} < limits
-    assert LIMITS[0] <= min(limits) < 150.0 < max(limits) == LIMITS[1]
-    obedience = [
-        each.corridor.geometry.largest_speed_limit / each.limit for each in drawn_ones["compliance"]
-    ]
-    assert 0.7 <= min(obedience) < 0.75
-    assert 1.1 < max(obedience) <= 1.15
-    for road in roads["convoys"]:
-        slowest = road.conditions.vehicle_classes[-1]
-        limits_of_load = [phase[2] for each in road.conditions.incidents for phase in each.phases]
-        assert slowest.name == "convoy" or max(limits_of_load) <= 50.0
-    for road in roads["weaving"]:
-        (on,), (off,) = road.geometry.on_ramps, road.geometry.off_ramps
-        assert (off - on) * road.geometry.segment_lengths[0] == pytest.approx(0.5, abs=0.13)
-        assert {4, 5} >= set(road.geometry.segment_lanes[: road.geometry.n_mainline])
-    assert {road.geometry.lanes for road in roads["autobahn"]} == {3}
+def test_highways_are_those_that_weights_were_trained_on_and_rows_were_played_on():
+    digest = hashlib.sha256()
+    for kind, number in product(KINDS, range(40)):
+        highway = draw_highway(number, kind)
+        digest.update(f"{highway.corridor.digest} {highway.limit}".encode())
+    assert digest.hexdigest()[:16] == "4d1556bbe5d24708"
 
 
 @pytest.fixture(scope="module")
