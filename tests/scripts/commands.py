@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 from scripts import dptse
 
+ROAD = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
+"""A road file."""
+
 
 class Done(NamedTuple):
     returncode: int

@@ -28,7 +28,7 @@ from scripts.dptse import MODULES
 from tests.helpers import ROOT, SHORT, save_untrained
 from tests.importers.data import plain, stream
 from tests.importers.sumo_net.conftest import motorway
-from tests.scripts.commands import refused, run_command
+from tests.scripts.commands import ROAD, refused, run_command
 from tests.scripts.test_import_policy import save_model
 
 KINDS = ["trajectories", "network", "field", "policy"]
@@ -79,8 +79,7 @@ def test_the_example_of_the_help_runs_as_it_is_printed(name, tmp_path, monkeypat
     line = re.search(r"^dptse ((?:.*\\\n)*.*)", page, re.MULTILINE)[1].replace("\\\n", " ")
     write_data(tmp_path)
     if name == "fit":
-        road = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
-        (tmp_path / "my-road.toml").write_text(road)
+        (tmp_path / "my-road.toml").write_text(ROAD)
     if name == "import policy":
         save_model(tmp_path, bandwidth=1)
     if "--report" in line:

@@ -1,7 +1,6 @@
 """Evaluation by the command: the same numbers in tables, Markdown, JSON and rows."""
 
 import json
-import warnings
 from itertools import groupby
 
 import gymnasium as gym
@@ -95,20 +94,6 @@ def test_what_is_begun_anew_leaves_no_results_that_do_not_describe_it(tmp_path, 
     # What is left has another seed too, which is not asked for.
     found = json.loads(run_command(*words, "2001", "--json").stdout)
     assert {row["means"]["error"]["n"] for row in found["rows"]} == {1}
-
-
-def test_a_run_warns_once_of_values_of_another_road(tmp_path, caplog):
-    road = tmp_path / "road.toml"
-    road.write_text("n_mainline = 4\nduration = 62\n[demand]\nmainline = [[0, 1500]]\n")
-    env = f'dptse_env:dptse/PaperHighway-v0 {{"corridor": "{road}", "bandwidth": 2}}'
-    words = ["--env", env, "--test-seeds", "2000", "--policies", "none", "--workers", "1"]
-    words += ["--records", tmp_path / "records", "--output", tmp_path / "out"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        done = run_command("evaluate", *words, "--estimators", "ekf", "random_walk")
-    assert done.returncode == 0, done.stderr
-    assert sum("on another road" in each.message for each in caplog.records) == 1
-    assert "Warning" not in done.stderr
 
 
 def test_policies_and_schedules_play_what_gym_make_makes(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 from dptse_env.traffic import Demand, RecordLibrary, read_corridor
 from scripts.evaluate import not_published
 from tests.helpers import ROOT, make_env
-from tests.importers.data import STRAIGHT, driven, plain, stream, write_csv
+from tests.importers.data import driven, plain, stream, write_csv
 from tests.importers.sumo_net.conftest import PATH, motorway
 from tests.importers.test_fields import write
 from tests.importers.test_tables import FOOT, ngsim
@@ -61,24 +61,6 @@ def test_trajectories_become_a_road_that_the_other_commands_take(road, tmp_path)
     # A folder of records is never replaced.
     assert "output" in refused("import", *words, "--format", "table", "--columns", *columns)
     assert new.is_file()
-
-
-def test_a_mapping_describes_the_data(road, tmp_path):
-    (tmp_path / "data.toml").write_text(
-        'format = "ngsim"\n[where]\nLocation = "us-101"\n[layout.mainline]\nlanes = [1, 2, 3]\n'
-    )
-    columns = ngsim(stream())
-    columns["Location"] = ["us-101"] * len(columns["Vehicle_ID"])
-    path = write_csv(tmp_path / "a.csv", columns)
-    run(
-        "trajectories", "--files", path, "--env", on(road), "--output", tmp_path / "new",
-        "--mapping", tmp_path / "data.toml", "--shares", "1", "0", "0",
-    )  # fmt: skip
-    assert read_corridor(tmp_path / "new" / "road.toml").geometry.n_mainline == 4
-    assert (
-        RecordLibrary().get(read_corridor(tmp_path / "new" / "road.toml"), 4).n_steps
-        == STRAIGHT.conditions.duration + 1
-    )
 
 
 @pytest.fixture(scope="module")

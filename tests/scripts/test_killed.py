@@ -21,6 +21,7 @@ from agents.training.run_files import read_progress
 from tests.agents.training.plans import SMALL, STEPS, without_time
 from tests.helpers import SHORT, run_killed
 from tests.scripts import test_train_estimator
+from tests.scripts.commands import ROAD
 
 pytestmark = [
     pytest.mark.slow,
@@ -29,7 +30,6 @@ pytestmark = [
 
 UPDATED = "dptse_env.utils.progress:tqdm", "update"
 KEPT = "agents.training.run_files:TrainingFolder", "keep"
-ROAD = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
 TRAIN = ["train", "--env", f'{SHORT} {{"horizon": 64}}', "--train-seeds", "0:2"]
 TRAIN += ["--validation-seeds", "1000:1001", "--output", "out", "--algorithm"]
 

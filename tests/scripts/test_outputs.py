@@ -18,11 +18,10 @@ from scripts.dptse import MODULES
 from tests.helpers import SHORT, fast_and_slow
 from tests.importers.data import plain, stream
 from tests.importers.sumo_net.conftest import motorway
-from tests.scripts.commands import refused, run_command
+from tests.scripts.commands import ROAD, refused, run_command
 from tests.scripts.test_imports import on
 from tests.scripts.test_train_estimator import SMALL
 
-ROAD = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
 TABLE = "\n".join(" ".join(["30"] * 60) for _ in range(16))
 ONE = ["--workers", "1"]
 COMMANDS = {

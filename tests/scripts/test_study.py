@@ -10,7 +10,7 @@ from agents.studies.suite import RECORDED
 from agents.study import Place, read_rows
 from dptse_env.config import VALIDATION_SEEDS
 from examples.my_study import STUDY
-from scripts.study import STUDIES, Args, find_study, main
+from scripts.study import Args, find_study, main
 from tests.scripts.commands import run_command
 
 MINE, SHORT = "examples.my_study:STUDY", STUDY.cells[0].env
@@ -23,14 +23,6 @@ ROADS = replace(STUDY, cells=MIXED, follow=lambda rows, folder: MIXED)
 
 def numbered(number):
     return number and replace(STUDY, seeds=tuple(range(2000, 2000 + number)))
-
-
-@pytest.mark.parametrize("name", STUDIES)
-def test_every_study_is_found_and_a_cell_has_one_set_of_labels(name):
-    study = find_study(Args(name=name))
-    assert study.name == name
-    labels = {cell.id: cell.labels for cell in study.cells}
-    assert all(cell.labels == labels[cell.id] for cell in study.cells)
 
 
 def test_the_cells_of_an_environment_are_played_with_its_keywords_and_others_are_told(capsys):

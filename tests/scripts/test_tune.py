@@ -3,10 +3,9 @@ import json
 import gymnasium as gym
 
 from tests.helpers import SHORT
-from tests.scripts.commands import refused, run_command
+from tests.scripts.commands import ROAD, refused, run_command
 
 TUNE = ("fit", "--tune", "--trials", "3", "--estimators", "random_walk")
-ROAD = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
 
 
 def of(privacy):

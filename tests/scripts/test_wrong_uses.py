@@ -16,10 +16,9 @@ from dptse_env.traffic import library
 from tests.helpers import SHORT
 from tests.importers.data import plain, stream
 from tests.importers.sumo_net.conftest import motorway
-from tests.scripts.commands import run_command
+from tests.scripts.commands import ROAD, run_command
 from tests.scripts.test_outputs import begin
 
-ROAD = "n_mainline = 4\nduration = 90\n[demand]\nmainline = [[0, 2400]]\n"
 USES = {
     "": {
         "recrod": "recrod … evaluate … record",
