@@ -137,24 +137,19 @@ TASK = """
 import os, pathlib, time
 folder = pathlib.Path({folder!r})
 (folder / str(os.getpid())).touch()
-while {forever} or len(list(folder.iterdir())) < 2:
+while True:
     time.sleep(0.01)
-1 / 0
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("one_fails", [False, True])
-def test_what_still_runs_is_ended_where_another_fails_or_the_program_is_killed(tmp_path, one_fails):
-    tasks = [TASK.format(folder=str(tmp_path), forever=each) for each in (True, not one_fails)]
-    command = [sys.executable, "-c", PROGRAM, *tasks]
+def test_what_still_runs_is_ended_where_the_program_is_killed(tmp_path):
+    command = [sys.executable, "-c", PROGRAM, *[TASK.format(folder=str(tmp_path))] * 2]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as program:
         try:
-            if not one_fails:
-                wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
-                program.kill()
-            # The pipe is open as long as there is any process.
-            assert ("ZeroDivisionError" in program.communicate(timeout=300)[1]) == one_fails
+            wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
+            program.kill()
+            program.communicate(timeout=300)  # the pipe is open as long as there is any process
         finally:
             program.kill()
 

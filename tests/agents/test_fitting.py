@@ -14,7 +14,6 @@ import pytest
 
 pytest.importorskip("tomlkit")
 
-from agents.environments import preset_of, quietly
 from agents.executors import this_process
 from agents.fitting import parameters as searching
 from agents.fitting.budget import NO_NOISE, advice, budget_table
@@ -31,7 +30,6 @@ from dptse_env.model.parameters import write_parameters
 from dptse_env.traffic import RecordLibrary, read_road, write_corridor
 from dptse_env.versions import code_version
 from scripts.fit import Args, estimators_tried
-from tests.helpers import save_untrained
 from tests.scripts.commands import refused, run_command
 
 ID = "dptse_env:dptse/PrivateHighway-v1"
@@ -295,23 +293,6 @@ def test_what_the_file_has_is_compared_and_stays_unless_it_is_beaten(
     errors_of(monkeypatch, lambda labels: errors[labels["parameters"]])
     choice.choose("estimator", options)
     assert (choice.parameters, choice.estimator) == (("my-road", "ekf") if kept else present[0])
-
-
-def test_a_saved_policy_may_be_among_those_to_choose_from(tmp_path):
-    pytest.importorskip("sb3_contrib")
-    path = tmp_path / "my-road.toml"
-    path.write_text(ROAD)
-    road = road_in(tmp_path)
-    policy = tmp_path / "mine.safetensors"
-    with quietly():
-        save_untrained(policy, preset=preset_of(ID), corridor=str(path), bandwidth=2)
-    road.cell(str(policy)).check()
-    road.write_played(tmp_path, 5.0)
-    place = Place(tmp_path, this_process, tmp_path / "records")
-    choice = Choice(road, place, {"w99-3lane": {"parameters": "w99-3lane"}}, parameters="w99-3lane")
-    choice.choose("policy", [{"policy": "round-robin"}, {"policy": str(policy)}])
-    assert set(choice.rows["policy"]) == {"round-robin", str(policy)}
-    assert choice.notes == []
 
 
 @pytest.mark.parametrize(
