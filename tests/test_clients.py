@@ -3,9 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from sb3_contrib import QRDQN, TQC, MaskablePPO, RecurrentPPO
+from sb3_contrib import QRDQN, MaskablePPO, RecurrentPPO
 from sb3_contrib.common.maskable.utils import get_action_masks
-from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
+from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
 from dptse_env.evaluation import evaluate
@@ -20,8 +20,7 @@ DISCRETE, BOX, SLOTS = (
 ROLLOUT, REPLAY = {"n_steps": 16, "batch_size": 16}, {"learning_starts": 8, "batch_size": 8}
 LEARNERS = [
     (PPO, MASK, ROLLOUT), (PPO, DISCRETE, ROLLOUT), (A2C, SLOTS, {"n_steps": 8}),
-    (DQN, DISCRETE, REPLAY), (QRDQN, DISCRETE, REPLAY),
-    (SAC, BOX, REPLAY), (TD3, BOX, REPLAY), (TQC, BOX, REPLAY),
+    (QRDQN, DISCRETE, REPLAY), (SAC, BOX, REPLAY),
     (MaskablePPO, MASK, ROLLOUT), (MaskablePPO, SLOTS, ROLLOUT), (MaskablePPO, DISCRETE, ROLLOUT),
     (RecurrentPPO, SLOTS, ROLLOUT),
 ]  # fmt: skip

@@ -3,7 +3,6 @@
 import pytest
 
 from agents.environments import heading, parse_env, settings_of
-from dptse_env.registration import ENVIRONMENTS
 
 PRIVATE = "dptse_env:dptse/PrivateHighway-v1"
 
@@ -23,14 +22,12 @@ def test_a_heading_names_what_is_in_force():
 @pytest.mark.parametrize(
     ("keywords", "named"),
     [
-        ('{"bandwidth": 1}', "bandwidth 1"),
         ('{"penetration": [0.1, 0.3]}', "penetration 0.1 to 0.3"),
         ('{"penetration": {"misreporting": 0.1}}', "penetration.misreporting 0.1"),
         ('{"corridor": {"fixed_sensors": []}}', "no fixed sensors"),
         ('{"sensor_settings": {"absolute": 2}}', "sensor_settings.absolute 2.0"),
         ('{"epsilon": 1}', "release model paced (epsilon 1, delta 0.05)"),
         ('{"privacy": {"preset": "capped", "cap": 16}}', "privacy.cap 16"),
-        ('{"parameters": "published"}', "parameters published"),
         ('{"horizon": 300}', "horizon 300"),
         ('{"loops": {"positions": [0, 0.5]}}', "loops at 0 km, 0.5 km every 20 s"),
         (
@@ -77,20 +74,8 @@ def test_settings_in_force_have_a_name(keywords, settings):
     assert settings_of(PRIVATE, keywords) == settings
 
 
-@pytest.mark.parametrize("env", ["nope", "CartPole-v1", "nope:dptse/ShortHighway-v0", ""])
-def test_another_id_is_refused_with_those_of_this_package(env):
-    with pytest.raises(ValueError, match="env must be the id") as refused:
-        parse_env(env)
-    assert all(name in str(refused.value) for name in ENVIRONMENTS)
-
-
 def test_a_module_that_raises_is_refused(tmp_path, monkeypatch):
     (tmp_path / "broken_module.py").write_text("1 / 0")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ValueError, match="'broken_module' cannot be imported: ZeroDivision"):
         parse_env("broken_module:dptse/ShortHighway-v0")
-
-
-def test_what_follows_an_id_must_be_an_object():
-    with pytest.raises(ValueError, match="env must be an id and a JSON object"):
-        parse_env(f"{PRIVATE} [1]")
