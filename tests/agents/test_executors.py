@@ -158,3 +158,8 @@ def test_what_an_interruption_leaves_is_removed_without_a_word():
     left = "import loky.backend.resource_tracker as own\nown.register('/left', 'semlock')"
     command = [sys.executable, "-c", f"{PROGRAM}{left}", "1", "2"]
     assert subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stderr == b""
+
+
+def test_an_address_is_for_ray_alone():
+    with pytest.raises(ValueError, match=r"address must be .* got 'auto'"):
+        make_executor("local", 1, "auto")
