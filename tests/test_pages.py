@@ -81,7 +81,7 @@ def test_links_lead_somewhere():
 
 def test_the_site_is_refused_with_dead_links_and_with_files_of_other_hosts(tmp_path):
     (tmp_path / "page.html").write_text(
-        '<h1 id="ε">A</h1> <a href="/page.html#%CE%B5">a</a> <a href="#no">b</a>'
+        '<h1 id="ε">A</h1> <a href="/page.html#%CE%B5">a</a> <a href="#no">b</a> <img src="no.png">'
         '<a href="https://far.example">c</a> <script src="https://far.example/c.js"></script>'
     )
     (tmp_path / "a.css").write_text("a {b: url(https://far.example/d.woff)} c {d: url(e.png)}")
@@ -90,6 +90,7 @@ def test_the_site_is_refused_with_dead_links_and_with_files_of_other_hosts(tmp_p
         "a.css: fetches https://far.example/d.woff",
         "page.html: #no is no anchor",
         "page.html: fetches https://far.example/c.js",
+        "page.html: no.png does not exist",
     ]
 
 
