@@ -39,6 +39,28 @@ def test_what_has_no_statistic_is_refused():
             function(*given)
 
 
+def coverage(make_interval, spreads, n_trials=300, n_runs=5, n_traffic=64):
+    """The share of intervals that cover 0, for spreads of runs, of traffic and of cells."""
+    rng, of_runs, of_traffic, of_cells = np.random.default_rng(1), *spreads
+    covered = 0
+    for _ in range(n_trials):
+        table = of_runs * rng.standard_normal((n_runs, 1))
+        table = table + of_traffic * rng.standard_normal((1, n_traffic))
+        interval = make_interval(table + of_cells * rng.standard_normal((n_runs, n_traffic)))
+        covered += interval.low <= 0.0 <= interval.high
+    return covered / n_trials
+
+
+def two_level(table):
+    return bootstrap(interquartile_mean, table, n_resamples=400)
+
+
+@pytest.mark.slow
+def test_the_bootstrap_covers_where_traffic_decides_and_says_where_it_does_not():
+    assert 0.92 < coverage(two_level, (1.0, 8.0, 2.0)) < 0.98
+    assert 0.84 < coverage(two_level, (1.0, 0.0, 0.5)) < 0.93  # as its docstring admits
+
+
 def test_the_bootstrap_finds_a_known_effect_that_pairing_reveals():
     generator = np.random.default_rng(3)
     traffic = 50.0 + 10.0 * generator.standard_normal(64)
