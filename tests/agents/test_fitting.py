@@ -276,6 +276,17 @@ def test_a_choice_changes_where_another_one_is_certainly_better(
     assert (choice.estimator, choice.policy) == (chosen, "round-robin")
 
 
+def test_what_the_environment_refuses_for_one_reason_is_noted_once(tmp_path):
+    (tmp_path / "my-road.toml").write_text(ROAD)
+    road = road_in(tmp_path)
+    road.write_played(tmp_path, 5.0)
+    choice = Choice(road, Place(tmp_path, this_process), {}, parameters="w99-3lane")
+    policies = "static", "round-robin"
+    assert choice.play([choice.labels("test", bandwidth=9, policy=p) for p in policies]) == []
+    (note,) = choice.notes
+    assert note.startswith("refused is parameters w99-3lane")
+
+
 @pytest.mark.parametrize("kept", [False, True])
 def test_what_the_file_has_is_compared_and_stays_unless_it_is_beaten(
     kept, choice, tmp_path, monkeypatch
