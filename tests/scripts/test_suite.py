@@ -1,6 +1,7 @@
 """The suite by the command."""
 
 import json
+import shlex
 
 import pytest
 
@@ -74,3 +75,25 @@ def test_an_entry_goes_on_that_was_ended_before_its_first_row(tmp_path, monkeypa
         assert "output must be a folder of this entry" in refused(*words, *other)
     assert run_command(*words, *fresh, "--policies", policy).returncode == 0
     assert (tmp_path / "out" / "card.json").read_text() == card
+
+
+WRONG = {
+    "": "policies must be given with --suite",
+    "--policies nobody.safetensors": "nobody.safetensors",
+    "--policies nobody.toml": "nobody.toml",
+    "--policies nobody": "'nobody'",
+    "--policies static static": "policies must be different",
+    "--policies static --beside nobody.json": "nobody.json",
+    "--policies static --replay 2": "replay must be given with cards beside",
+    "--policies static --fresh 1": "fresh must be",
+    "none --policies static": "suite must be one of",
+    "--test-seeds 2000": "--test-seeds must be left out with --suite",
+    "--estimators ekf": "--estimators must be left out with --suite",
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_bad_input_is_named_before_anything_is_played(words, tmp_path):
+    given = "evaluate", "--suite", *shlex.split(words), "--output", tmp_path / "out"
+    assert WRONG[words] in refused(*given)
+    assert not (tmp_path / "out").exists()
