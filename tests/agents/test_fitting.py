@@ -11,13 +11,14 @@ import gymnasium as gym
 import numpy as np
 import polars as pl
 import pytest
+from scipy import stats
 
 pytest.importorskip("tomlkit")
 
 from agents.executors import this_process
 from agents.fitting import parameters as searching
 from agents.fitting.budget import NO_NOISE, advice, budget_table
-from agents.fitting.choice import Choice
+from agents.fitting.choice import ESTIMATORS_TRIED, Choice
 from agents.fitting.page import honesty
 from agents.fitting.parameters import fit_parameters, start_from
 from agents.fitting.road import find_road
@@ -421,3 +422,51 @@ def test_recordings_of_one_window_say_what_is_missing(tmp_path):
     assert f"{path}: recordings must have a window of validation traffic" in line
     assert "shorter duration" in line
     assert files_of(path.parent) == before
+
+
+LORRIES = """n_mainline = 20
+lanes = 2
+segment_length = 0.15
+speed_limit = 120
+duration = 240
+
+[demand]
+mainline = [[0, 1800]]
+
+[[vehicle_classes]]
+name = "car"
+share = 0.75
+
+[[vehicle_classes]]
+name = "lorry"
+share = 0.25
+length = 12.0
+largest_speed = 85.0
+"""
+
+
+@pytest.mark.slow
+def test_no_estimator_is_proposed_that_loses_to_another_one_where_lorries_share_a_road(tmp_path):
+    path = tmp_path / "lorries.toml"
+    path.write_text(LORRIES)
+    words = (
+        "--trials", "12", "--train-seeds", "0:3", "--validation-seeds", "1000:1008",
+        "--test-seeds", "2000:2002", "--policies", "round-robin", "expected-reduction",
+    )  # fmt: skip
+    done = run_command("fit", path, *words, "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    compared = found["validation"]["estimator"]
+    assert {each["estimator"] for each in compared} == set(ESTIMATORS_TRIED)
+    assert {each["policy"] for each in compared} == {found["policy"]}
+    keys = "parameters", "estimator"
+    (own,) = (each for each in compared if all(each[key] == found[key] for key in keys))
+    for each in compared:
+        gain = np.subtract(own["error"], each["error"])
+        spread = stats.sem(gain)
+        assert each is own or gain.mean() <= stats.t.ppf(0.975, len(gain) - 1) * spread, each
+    least = {
+        name: min(np.mean(each["error"]) for each in compared if each["estimator"] == name)
+        for name in ESTIMATORS_TRIED
+    }
+    assert least["recurrent"] < 1.1 * least[found["estimator"]], (found["estimator"], least)

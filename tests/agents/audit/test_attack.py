@@ -162,6 +162,14 @@ def test_a_guarantee_is_not_rejected_and_half_the_noise_is(setting, record):
     assert verdict(setting, worlds, noise_factor=0.5) == "rejected"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", [config(epsilon=5.0), paced("ekf")])
+def test_noise_times_0709_is_rejected_after_five_thousand_runs(setting, record):
+    worlds = Planner(setting).choose(record, "worst-case")
+    assert verdict(setting, worlds, 5000) == "not rejected"
+    assert verdict(setting, worlds, 5000, noise_factor=0.709) == "rejected"
+
+
 class AskedTooOften(Capped):
     """A vehicle counts once more whenever the estimator predicts a free road."""
 

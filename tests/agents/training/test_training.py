@@ -64,6 +64,26 @@ def whole(tmp_path_factory):
 # --- going on -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
+def test_a_full_disk_leaves_a_folder_to_go_on_in(whole, tmp_path, monkeypatch):
+    replace, written = Path.replace, []
+
+    def full(path, target):
+        written.append(target.name)
+        if target.name == CHECKPOINT and written.count(CHECKPOINT) == 2:
+            raise OSError(28, "No space left on device")
+        return replace(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pathlib.Path.replace", full)
+        with pytest.raises(OSError, match="No space left"):
+            train(make_plan(), tmp_path / "full")
+    with monkeypatch.context() as patch:
+        patch.setattr("agents.training.training.regress", None)  # it is not done again
+        train(make_plan(), tmp_path / "full")
+    assert_alike(tmp_path / "full", whole()[0])
+
+
 @pytest.mark.parametrize("name", ["plackett-luce", "ppo"])
 def test_a_finished_training_is_left_alone(name, whole, tmp_path):
     folder = shutil.copytree(whole(name)[0], tmp_path / "run")
