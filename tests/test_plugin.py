@@ -95,24 +95,6 @@ def test_a_claim_is_shown_as_it_is_made_and_a_reason_against_it_named():
         gym.make(SHORT, privacy={"preset": Doubtful, "boundary_inputs": "nominal"})
 
 
-@pytest.mark.slow
-def test_spawned_workers_know_modules(monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", SOURCE)
-    envs = gym.make_vec(
-        "dptse_env:dptse/ShortHighway-v0",  # another process knows no id of the tests
-        num_envs=2,
-        vectorization_mode="async",
-        vector_kwargs={"context": "spawn"},
-        bandwidth=2,
-        **keywords(by_module),
-    )
-    try:
-        envs.reset(seed=0)
-        assert np.isfinite(envs.step(envs.action_space.sample())[1]).all()
-    finally:
-        envs.close()
-
-
 def test_a_name_is_valid_and_stands_for_one_part():
     for arguments, message in (
         (("estimator", "ekf", parts.Smoothed), "estimator: 'ekf' ships with dptse_env"),
