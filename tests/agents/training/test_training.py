@@ -3,6 +3,7 @@
 import json
 import shutil
 from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -81,7 +82,8 @@ def test_a_full_disk_leaves_a_folder_to_go_on_in(whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("agents.training.training.regress", None)  # it is not done again
         train(make_plan(), tmp_path / "full")
-    assert_alike(tmp_path / "full", whole()[0])
+    for name in POLICIES:
+        assert (tmp_path / "full" / name).read_bytes() == (whole()[0] / name).read_bytes()
 
 
 @pytest.mark.parametrize("name", ["plackett-luce", "ppo"])
