@@ -121,12 +121,12 @@ def test_the_page_on_own_data_imports_a_field(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("more", "missing", "next_ones"),
     [
-        (("--duration", "200"), "validation and test", []),
-        (("--duration", "90", "--shares", "0", "0", "1"), "training and validation", ["evaluate"]),
+        (("--duration", "300"), "validation and test", []),
+        (("--duration", "140", "--shares", "0", "0", "1"), "training and validation", ["evaluate"]),
     ],
 )
 def test_a_field_says_what_is_missing_for_what_comes_next(more, missing, next_ones, tmp_path):
-    field = write(tmp_path, intervals=60)
+    field = write(tmp_path)
     printed = run(
         "field", "--density", field.density, "--speed", field.speed, "--cell", "0.05",
         "--interval", "5", "--density-unit", "veh/ft", "--speed-unit", "ft/s",
