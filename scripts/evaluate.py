@@ -86,7 +86,7 @@ class Args(
     estimators: tuple[str, ...] = ()
     """Estimators by name or "module:Class"; the environment's own if none."""
     test_seeds: str = "2000:2008"
-    """Traffic seeds, first:stop; those of validation begin with 1000."""
+    """Traffic seeds, first:stop; validation begins at 1000."""
     seed: int = 0
     """Seeds noise and estimators, one stream for each traffic seed."""
     reference: str | None = None
