@@ -284,7 +284,7 @@ LABELS = {
 }
 """Names of the estimators in figures and tables."""
 ESTIMATOR_LOOKS = {
-    "ekf": Look("#1a80c4", "o"),
+    "ekf": Look(COLOURS[0], "o"),
     "ukf": Look("#d55e00", "s"),
     "enkf": Look("#009e73", "^"),
     "mhe": Look("#cc79a7", "D"),

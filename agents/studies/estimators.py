@@ -27,6 +27,7 @@ from agents.environments import (
     guarantee_of,
 )
 from agents.figures import (
+    COLOURS,
     ERROR_TICKS,
     LABELS,
     WIDTH,
@@ -411,7 +412,7 @@ def draw_arms(rows: pl.DataFrame) -> Figure:
     percent = [100.0 * share for share in SHARES.values()]
     arms = {
         "queries and fixed sensors": (BOTH, Look("#d55e00", "s")),
-        "queries alone": (QUERIES, Look("#1a80c4", "o", "--")),
+        "queries alone": (QUERIES, Look(COLOURS[0], "o", "--")),
     }
     for axis, pair in zip(axes.flat, product(RELEASES, (EKF, LEARNED)), strict=True):
         release, estimator = pair
