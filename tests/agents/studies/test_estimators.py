@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import gymnasium as gym
 import numpy as np
 import polars as pl
@@ -7,12 +5,10 @@ import polars as pl
 from agents.studies import estimators as study
 from agents.study import read_rows
 
-RECORDED = Path(__file__).parents[3] / "results" / "estimators"
 
-
-def test_what_was_not_played_is_a_dash_and_no_figure(tmp_path):
+def test_what_was_not_played_is_a_dash_and_no_figure(results, tmp_path):
     """As if two estimators of the first part were played alone."""
-    rows = read_rows("estimators", RECORDED)
+    rows = read_rows("estimators", results / "estimators")
     some = rows.filter(pl.col("estimator").is_in(["ekf", "recurrent"]), part="estimators")
     some = some.drop(name for name in some.columns if some[name].null_count() == len(some))
     for name in study.FIGURES:

@@ -1,5 +1,4 @@
 import math
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -21,12 +20,10 @@ from dptse_env.privacy import epsilon_of
 from dptse_env.schedules import make_schedule
 from tests.helpers import SHORT
 
-FOLDER = Path(__file__).parents[3] / "results" / "guarantees"
-
 
 @pytest.fixture(scope="module")
-def rows():
-    return read_rows("guarantees", FOLDER)
+def rows(results):
+    return read_rows("guarantees", results / "guarantees")
 
 
 def line_of(text, start):

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -11,17 +10,15 @@ from agents.studies import paper
 from agents.studies.paper import CELLS, SETTINGS, STUDY, judge, tables_of, with_times
 from agents.study import Place, read_rows, read_table, run
 
-RESULTS = Path(__file__).parents[3] / "results" / "paper"
+
+@pytest.fixture(scope="module")
+def rows(results):
+    return read_rows("paper", results / "paper")
 
 
 @pytest.fixture(scope="module")
-def rows():
-    return read_rows("paper", RESULTS)
-
-
-@pytest.fixture(scope="module")
-def times():
-    return read_table(RESULTS / paper.RUN_TIME)
+def times(results):
+    return read_table(results / "paper" / paper.RUN_TIME)
 
 
 def entries(text, first):
@@ -80,7 +77,7 @@ def test_statistics_of_curves():
 
 
 @pytest.mark.slow
-def test_two_cells_are_played_measured_and_reported(tmp_path, monkeypatch):
+def test_two_cells_are_played_measured_and_reported(results, tmp_path, monkeypatch):
     first, second, *_ = SETTINGS
     monkeypatch.setattr(paper, "PAIRS", [("random_walk", first)])
     monkeypatch.setattr(paper, "N_TIMED", 2)
@@ -93,5 +90,5 @@ def test_two_cells_are_played_measured_and_reported(tmp_path, monkeypatch):
     assert read_table(tmp_path / paper.RUN_TIME)["seconds"].min() > 0.0
     maps = read_table(tmp_path / paper.SPACE_TIME)
     assert np.shape(maps["estimate"].to_list()) == (1, 141, 15)
-    assert maps.columns == read_table(RESULTS / paper.SPACE_TIME).columns
+    assert maps.columns == read_table(results / "paper" / paper.SPACE_TIME).columns
     assert not list(tmp_path.glob("*.png"))

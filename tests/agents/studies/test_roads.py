@@ -13,13 +13,12 @@ from dptse_env.estimators import recurrent
 from dptse_env.importers.folder import ROAD
 from dptse_env.traffic import CORRIDORS, write_corridor
 
-RECORDED = Path(__file__).parents[3] / "results" / "roads"
 WEIGHTS = Path(recurrent.__file__).parent / "weights"
 
 
 @pytest.fixture
-def rows():
-    return read_rows("roads", RECORDED)
+def rows(results):
+    return read_rows("roads", results / "roads")
 
 
 def test_drawn_roads_are_no_training_roads_and_have_all_filters():
