@@ -4,7 +4,8 @@ They are recorded in ``tests/mutants.jsonl``: those with a name break a line of 
 others were drawn. ``python -m tests.mutants`` makes all one by one in a copy of the repository,
 runs the tests of their module there, and prints which test has caught each; with words only the
 mutants whose name, file or line of the proof has one of them. It ends with status 1 where a mutant
-lives, which is a missing test, where one cannot be made any more, or where tests fail without one.
+lives, which is a missing test, where one is no sound Python or cannot be made any more, or where
+tests fail without one.
 It takes an hour: run it after a change to what ``docs/privacy/proof.md`` names, and draw
 mutants anew of lines that have changed.
 
@@ -32,7 +33,7 @@ from typing import NamedTuple
 from dptse_env.utils.kernels import default_folder
 
 ROOT = Path(__file__).parents[1]
-SPARED = (".*", "__pycache__", "build", "dist", "results")
+SPARED = (".*", "__pycache__", "build", "dist")
 """Names that no copy needs, at any depth."""
 
 MOST_SECONDS = 600.0
@@ -265,12 +266,17 @@ def main(words: list[str]) -> int:
             file, start = copy / mutant.path, time.monotonic()
             kept = shutil.copy2(file, Path(folder, "kept"))
             file.write_text(mutant.applied(), encoding="utf-8")
-            killer = failed(copy, mutant.tests.split(), **environment)
+            try:
+                killer = failed(copy, mutant.tests.split(), **environment)
+                told = killer or "**lives**"
+            except RuntimeError as problem:
+                killer, told = "", "**nothing that tells**"
+                print(problem, file=sys.stderr)
             shutil.copy2(kept, file)
             n_lived += not killer
             seconds = time.monotonic() - start
             print(
-                f"| {mutant} | {mutant.line} | {killer or '**lives**'} | {seconds:.0f} |",
+                f"| {mutant} | {mutant.line} | {told} | {seconds:.0f} |",
                 flush=True,
             )
     print(f"\n{len(mutants) - n_lived} of {len(mutants)} mutants die")
